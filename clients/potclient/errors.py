@@ -1,0 +1,201 @@
+"""Everything the client raises on purpose: the server's errors under the server's own names, and the client's own."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from potschemas.messages import ErrorCode, ErrorReply
+
+if TYPE_CHECKING:
+    from potclient.results import Receipt
+
+
+class PotclientError(Exception):
+    """Base of all expected errors; `retryable` says whether the same call may succeed later."""
+
+    retryable: bool = False
+    retry_after_s: float | None = None
+
+
+# --- the client's own --------------------------------------------------------------------------------------------------------
+
+
+class NoServerError(PotclientError):
+    """Nobody serves this map here: no connection, no server behind it, or one that is still warming up."""
+
+    retryable = True
+
+
+class QueryTimeoutError(PotclientError, TimeoutError):
+    """A server took the question and did not answer in time, or a wait ended before its condition held."""
+
+    retryable = True
+
+
+class LostReplyError(PotclientError):
+    """A server is there and the question got no answer at all: denied, cut off by a size filter, or it died on the way."""
+
+    retryable = True
+
+
+class IncompleteReplyError(PotclientError):
+    """A streamed reply misses parts, repeats them, or mixes revisions of the map."""
+
+    retryable = True
+
+
+class BadReplyError(PotclientError):
+    """The reply is not the message that the contract promises: versions differ, or something else answers on this key."""
+
+
+class ClosedError(PotclientError):
+    """The client is closed."""
+
+
+class DatasetError(PotclientError):
+    """A recording is missing, damaged, or not in the format it was opened as."""
+
+
+class UsageError(PotclientError):
+    """A setting or an argument is not usable; nothing was sent."""
+
+
+# --- the server's ------------------------------------------------------------------------------------------------------------
+
+
+class MapServerError(PotclientError):
+    """The server refused. `code` is contract (`potschemas.messages.ErrorCode`), the text is for people."""
+
+    code: str = "internal"
+    receipt: Receipt | None = None  # set where the refusal was a receipt of `MapClient.integrate`
+
+    def __init__(
+        self, message: str, *, retryable: bool | None = None, retry_after_s: float | None = None
+    ) -> None:
+        super().__init__(message)
+        if retryable is not None:
+            self.retryable = retryable
+        self.retry_after_s = retry_after_s
+
+
+class BadMessageError(MapServerError):
+    """The bytes were not the message that the key promises."""
+
+    code = "bad_message"
+
+
+class ShapeError(MapServerError):
+    """An array had the wrong shape, dtype or byte count."""
+
+    code = "bad_array"
+
+
+class BadPoseError(MapServerError):
+    """A pose is not a rigid transform, or not finite."""
+
+    code = "bad_pose"
+
+
+class BadPointsError(MapServerError):
+    """Coordinates are NaN or infinite."""
+
+    code = "bad_points"
+
+
+class EmptyError(MapServerError):
+    """Nothing to do: no points at all, or none inside the range limits."""
+
+    code = "empty"
+
+
+class TooLargeError(MapServerError):
+    """Bytes, points or cells beyond the server's limit."""
+
+    code = "too_large"
+
+
+class OutOfRangeError(MapServerError):
+    """Coordinates beyond what the map may hold."""
+
+    code = "out_of_range"
+
+
+class OldStampError(MapServerError):
+    """The stamp is not newer than the last accepted cloud of this robot."""
+
+    code = "old_stamp"
+
+
+class NoPoseError(MapServerError):
+    """The cloud has no pose, and the pose stream has none at its stamp."""
+
+    code = "no_pose"
+
+
+class UnknownRobotError(MapServerError):
+    """The robot's id is not legal, or not on the server's allow list."""
+
+    code = "unknown_robot"
+
+
+class UnknownAtomError(MapServerError):
+    """No atom of this id in the dictionary."""
+
+    code = "unknown_atom"
+
+
+class UnsupportedError(MapServerError):
+    """No such operation or verb."""
+
+    code = "unsupported"
+
+
+class OverloadedError(MapServerError):
+    """The server's queue is full; try again after `retry_after_s`."""
+
+    code = "overloaded"
+    retryable = True
+
+
+class DeadlineError(MapServerError):
+    """The deadline passed before the server could start."""
+
+    code = "deadline"
+    retryable = True
+
+
+class ShuttingDownError(MapServerError):
+    """The server takes no more work."""
+
+    code = "shutting_down"
+    retryable = True
+
+
+class InternalError(MapServerError):
+    """A bug of the server; the traceback is in its log."""
+
+    code = "internal"
+
+
+ERROR_CLASSES: dict[str, type[MapServerError]] = {cls.code: cls for cls in MapServerError.__subclasses__()}
+
+
+def error_from_code(
+    code: str | None, message: str, *, retryable: bool | None = None, retry_after_s: float | None = None
+) -> MapServerError:
+    """The exception for an error code; a code newer than this client gives the base class with that code."""
+    cls = ERROR_CLASSES.get(code or "", MapServerError)
+    error = cls(message, retryable=retryable, retry_after_s=retry_after_s)
+    if code is not None and cls is MapServerError:
+        error.code = code
+    return error
+
+
+def error_from_reply(reply: ErrorReply) -> MapServerError:
+    """The exception for a `reply_err` of the server."""
+    return error_from_code(
+        ErrorCode(reply.code).value,
+        reply.message,
+        retryable=reply.retryable,
+        retry_after_s=reply.retry_after_s,
+    )

@@ -1,0 +1,102 @@
+"""Pictures of a map: one horizontal layer, its mean and how sure it is."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from potclient.errors import UsageError
+from potclient.results import Grid
+
+_UNKNOWN = "#e4e4e4"
+
+
+def draw_layer(
+    grid: Grid,
+    path: Path,
+    *,
+    level_m: float | None = None,
+    hits: ArrayLike | None = None,
+    path_of_sensor: ArrayLike | None = None,
+    title: str = "",
+) -> None:
+    """Draw mean and standard deviation of the occupancy probability side by side; unknown cells stay grey.
+
+    Args:
+        grid: Any grid; one of its layers is drawn.
+        path: PNG file to write.
+        level_m: Height of the layer; the middle one by default.
+        hits: (N, 3) m, map frame: echoes to draw in, those that lie within the layer.
+        path_of_sensor: (S, 3) m, map frame: where the scans were taken.
+        title: Over the picture.
+    Raises:
+        UsageError: matplotlib is missing, or the level lies outside the grid.
+    """
+    try:
+        import matplotlib
+    except ImportError as error:
+        raise UsageError("pictures need the package matplotlib: pip install matplotlib") from error
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    nx, ny, nz = grid.shape
+    z_low, cell = float(grid.lower[2]), grid.resolution
+    layer = nz // 2 if level_m is None else math.floor((level_m - z_low) / cell)
+    if not 0 <= layer < nz:
+        raise UsageError(f"level {level_m} m is outside the grid, {z_low:g} to {z_low + nz * cell:g} m")
+    x, y = float(grid.lower[0]), float(grid.lower[1])
+    extent = (x, x + nx * cell, y, y + ny * cell)
+    known = grid.observed[:, :, layer]
+    width = 6.4
+    height = float(np.clip(width * ny / nx, 2.5, 9.0))
+    figure, axes = pyplot.subplots(
+        1, 2, figsize=(2 * width + 1, height + 1), layout="constrained", sharey=True
+    )
+    for axis, values, name, colours, top in (
+        (axes[0], grid.mean[:, :, layer], "P(occupied)", "RdYlBu_r", 1.0),
+        (axes[1], np.sqrt(grid.var[:, :, layer]), "its standard deviation", "viridis", 0.5),
+    ):
+        axis.set_facecolor(_UNKNOWN)
+        shown = np.ma.masked_where(~known, values)
+        image = axis.imshow(
+            shown.T, origin="lower", extent=extent, cmap=colours, vmin=0.0, vmax=top, interpolation="nearest"
+        )
+        if hits is not None:
+            points = np.asarray(hits, np.float64)
+            thick = max(cell, 0.15)
+            points = points[np.abs(points[:, 2] - (z_low + (layer + 0.5) * cell)) <= thick]
+            axis.plot(
+                points[:, 0],
+                points[:, 1],
+                ".",
+                color="black",
+                markersize=0.8,
+                alpha=0.5,
+                label="echoes in this layer",
+            )
+        if path_of_sensor is not None:
+            track = np.asarray(path_of_sensor, np.float64)
+            axis.plot(
+                track[:, 0],
+                track[:, 1],
+                "o-",
+                color="white",
+                mec="black",
+                markersize=4,
+                linewidth=1,
+                label="sensor",
+            )
+        axis.set(title=name, xlabel="x [m]", xlim=extent[:2], ylim=extent[2:])
+        figure.colorbar(image, ax=axis, shrink=0.8)
+    axes[0].set_ylabel("y [m]")
+    if hits is not None or path_of_sensor is not None:
+        axes[0].legend(loc="upper right", fontsize="x-small", markerscale=4)
+    head = f"{title}, " if title else ""
+    figure.suptitle(
+        f"{head}z = {z_low + (layer + 0.5) * cell:.2f} m, revision {grid.revision}, grey = unknown"
+    )
+    figure.savefig(path, dpi=110)
+    pyplot.close(figure)

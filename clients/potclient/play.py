@@ -1,0 +1,246 @@
+"""Play a recording into a map: every scan gets its receipt, and held-out beams judge the result."""
+
+from __future__ import annotations
+
+import dataclasses
+import threading
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from potclient.client import MapClient
+from potclient.datasets.scans import RecordedScan, Recording
+from potclient.errors import MapServerError
+from potclient.holdout import HoldOut, LabelledPoints
+from potclient.metrics import Metrics, score
+from potclient.results import Receipt
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class ScanOutcome:
+    """What became of one scan."""
+
+    index: int  # in the recording, as it was opened
+    name: str
+    seq: int
+    n_points: int  # beams sent
+    status: str  # accepted | dropped | rejected | unknown | dropped_by_client
+    reason: str | None = None
+    message: str | None = None
+    map_revision: int = 0
+    n_kernels: int = 0  # of the instantaneous map
+    n_kernels_added: int = 0
+    map_kernels: int = 0
+    queue_depth: int = 0
+    wait_ms: float = 0.0
+    integrate_ms: float = 0.0
+    round_trip_ms: float | None = None
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class PlayReport:
+    """What became of a recording."""
+
+    scans: list[ScanOutcome]
+    elapsed_s: float
+    held_out: Metrics | None = None
+    n_held_out: int = 0  # labelled points; the score may be of a fixed-seed sample of them
+
+    @property
+    def all_accepted(self) -> bool:
+        """Every scan has a receipt that says accepted."""
+        return all(scan.status == "accepted" for scan in self.scans)
+
+    def count(self, status: str) -> int:
+        """How many scans ended so."""
+        return sum(scan.status == status for scan in self.scans)
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain types, for a file."""
+        statuses = ("accepted", "dropped", "rejected", "unknown", "dropped_by_client")
+        return {
+            "n_scans": len(self.scans),
+            "counts": {status: self.count(status) for status in statuses},
+            "elapsed_s": self.elapsed_s,
+            "held_out": None if self.held_out is None else self.held_out._asdict(),
+            "n_held_out": self.n_held_out,
+            "scans": [dataclasses.asdict(scan) for scan in self.scans],
+        }
+
+
+def play(
+    client: MapClient,
+    recording: Recording,
+    *,
+    robot: str = "r1",
+    rate_hz: float | None = None,
+    lossless: bool = True,
+    acknowledged: bool = False,
+    keep_stamps: bool = False,
+    hold_out: HoldOut | None = None,
+    max_test_points: int = 200_000,
+    on_outcome: Callable[[ScanOutcome], None] | None = None,
+) -> PlayReport:
+    """Send all scans of a recording and wait for what becomes of them.
+
+    Scans are stamped with the time of sending unless `keep_stamps`, since a server refuses stamps that do not grow and would
+    therefore refuse a second round.
+
+    Args:
+        rate_hz: Scans a second at most; None goes as fast as the receipts come.
+        lossless: Wait for credit; false drops the older cloud as a live robot does.
+        acknowledged: Send by `integrate` instead, one after the other.
+        hold_out: Keep these beams back and score the map on them at the end.
+        max_test_points: Score a fixed-seed sample when there are more.
+        on_outcome: Called with every outcome as it is known, on a thread of the client's.
+    Raises:
+        PotclientError: no server, or it vanished; DatasetError: a file is damaged.
+    """
+    started = time.monotonic()
+    book = _Book(on_outcome)
+    labelled: list[LabelledPoints] = []
+    previous, client.on_receipt = client.on_receipt, book.on_receipt
+    try:
+        for index, recorded in enumerate(recording):
+            scan = recorded
+            if hold_out is not None:
+                scan, labels = hold_out.split(scan)
+                labelled.append(labels)
+            if rate_hz is not None:
+                time.sleep(max(0.0, started + index / rate_hz - time.monotonic()))
+            stamp_ns = scan.stamp_ns if keep_stamps else None
+            if acknowledged:
+                book.integrate(client, robot, index, scan, stamp_ns)
+            else:
+                book.publish(client, robot, index, scan, stamp_ns, wait=lossless)
+        client.flush()  # ends: a credit without a receipt runs out
+    finally:
+        client.on_receipt = previous
+    report = PlayReport(scans=book.finish(lossless), elapsed_s=time.monotonic() - started)
+    if hold_out is None:
+        return report
+    labels = LabelledPoints.concatenate(labelled)
+    return dataclasses.replace(
+        report, held_out=score_map(client, labels, max_test_points), n_held_out=len(labels)
+    )
+
+
+def score_map(
+    client: MapClient, labels: LabelledPoints, max_points: int = 200_000, seed: int = 0
+) -> Metrics | None:
+    """Score the map on labelled points, or on a fixed-seed sample of them; None if there are none."""
+    if len(labels) == 0:
+        return None
+    points, occupied = labels.points, labels.occupied
+    if len(labels) > max_points:
+        chosen = np.sort(np.random.default_rng(seed).choice(len(labels), max_points, replace=False))
+        points, occupied = points[chosen], occupied[chosen]
+    answer = client.occupancy(points)
+    return score(answer.mean, occupied, answer.observed)
+
+
+class _Book:
+    """Which scan has which number, and what its receipt said; receipts may come before `publish` returns."""
+
+    def __init__(self, on_outcome: Callable[[ScanOutcome], None] | None) -> None:
+        self._on_outcome = on_outcome
+        self._lock = threading.Lock()
+        self._sent: dict[int, tuple[int, RecordedScan]] = {}
+        self._early: dict[int, Receipt] = {}
+        self._outcomes: dict[int, ScanOutcome] = {}
+
+    def publish(
+        self,
+        client: MapClient,
+        robot: str,
+        index: int,
+        scan: RecordedScan,
+        stamp_ns: int | None,
+        *,
+        wait: bool,
+    ) -> None:
+        seq = client.publish(
+            scan.points,
+            scan.T_map_sensor,
+            robot=robot,
+            is_return=scan.is_return,
+            stamp_ns=stamp_ns,
+            wait=wait,
+        )
+        with self._lock:
+            self._sent[seq] = (index, scan)
+            receipt = self._early.pop(seq, None)
+        if receipt is not None:
+            self.on_receipt(receipt)
+
+    def integrate(
+        self, client: MapClient, robot: str, index: int, scan: RecordedScan, stamp_ns: int | None
+    ) -> None:
+        try:
+            receipt = client.integrate(
+                scan.points, scan.T_map_sensor, robot=robot, is_return=scan.is_return, stamp_ns=stamp_ns
+            )
+        except MapServerError as error:
+            if error.receipt is None:
+                status = "dropped" if error.retryable else "rejected"
+                self._book(
+                    ScanOutcome(
+                        index=index,
+                        name=scan.name,
+                        seq=0,
+                        n_points=len(scan),
+                        status=status,
+                        reason=error.code,
+                        message=str(error),
+                    )
+                )
+                return
+            receipt = error.receipt
+        self._book(_outcome(index, scan, receipt))
+
+    def on_receipt(self, receipt: Receipt) -> None:
+        with self._lock:
+            if receipt.seq not in self._sent:
+                self._early[receipt.seq] = receipt
+                return
+            index, scan = self._sent[receipt.seq]
+        self._book(_outcome(index, scan, receipt))
+
+    def _book(self, outcome: ScanOutcome) -> None:
+        with self._lock:
+            self._outcomes[outcome.index] = outcome
+        if self._on_outcome is not None:
+            self._on_outcome(outcome)
+
+    def finish(self, lossless: bool) -> list[ScanOutcome]:
+        """All outcomes in order; a scan without a receipt is unknown, or was dropped by the client where it may do so."""
+        for seq, (index, scan) in self._sent.items():
+            if index not in self._outcomes:
+                status = "unknown" if lossless else "dropped_by_client"
+                self._book(
+                    ScanOutcome(index=index, name=scan.name, seq=seq, n_points=len(scan), status=status)
+                )
+        return [self._outcomes[i] for i in sorted(self._outcomes)]
+
+
+def _outcome(index: int, scan: RecordedScan, receipt: Receipt) -> ScanOutcome:
+    m = receipt.message
+    return ScanOutcome(
+        index=index,
+        name=scan.name,
+        seq=m.seq,
+        n_points=len(scan),
+        status=m.status.value,
+        reason=m.reason,
+        message=m.message,
+        map_revision=m.map_revision,
+        n_kernels=m.n_kernels,
+        n_kernels_added=m.n_kernels_added,
+        map_kernels=m.map_kernels,
+        queue_depth=m.queue_depth,
+        wait_ms=m.wait_ms,
+        integrate_ms=m.integrate_ms,
+        round_trip_ms=None if receipt.round_trip_s is None else receipt.round_trip_s * 1e3,
+    )

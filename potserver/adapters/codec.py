@@ -1,0 +1,675 @@
+"""The only place where bytes become domain objects and back.
+
+Decoders check everything that can be checked without the map and raise typed errors; encoders return bytes
+with the Zenoh encoding that names their schema.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any, NamedTuple, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from potschemas import keys, messages, wire
+from potschemas.messages import DType, ErrorCode
+from potserver.adapters.limits import Limits
+from potserver.adapters.ports import Snapshot
+from potserver.domain.types import (
+    Atom,
+    Float64,
+    KernelSet,
+    MapUpdate,
+    Occupancy,
+    Scan,
+    SectorMatch,
+    check_rigid,
+)
+from potserver.errors import (
+    BadMessageError,
+    BadPointsError,
+    EmptyError,
+    OutOfRangeError,
+    PotserverError,
+    TooLargeError,
+    UnknownRobotError,
+    error_classes,
+)
+from potserver.services.health import Latency
+
+MessageT = TypeVar("MessageT", bound=messages.Message)
+UNKNOWN_SEQ = -1  # in the receipt of a cloud whose number could not be read
+_UNSET_ENCODING = "zenoh/bytes"  # what Zenoh reports when the sender named none
+_MAX_SMALL_BYTES = 4096  # of messages without arrays
+_FLOATS = (DType.FLOAT32, DType.FLOAT64)
+_ERRORS = error_classes()
+# float32 would round a sure answer up to certainty, which costs an infinite log-loss when it is wrong
+_BELOW_ONE = float(np.nextafter(np.float32(1), np.float32(0)))
+
+
+class Wire(NamedTuple):
+    """A message ready to send."""
+
+    payload: bytes
+    encoding: str
+
+
+class CloudHead(NamedTuple):
+    """What of a cloud can be read even when the rest is unsound."""
+
+    seq: int
+    robot_id: str | None
+
+
+class PointsRequest(NamedTuple):
+    """A decoded `q/points`."""
+
+    points: NDArray[np.floating[Any]]  # (N, 3) or (N, 2) m, map frame
+    deadline_ms: float | None
+
+
+class GridRequest(NamedTuple):
+    """A decoded `q/grid`."""
+
+    lower: list[float]
+    upper: list[float]
+    resolution: float
+    deadline_ms: float | None
+
+
+class ParamsRequest(NamedTuple):
+    """A decoded `q/params`."""
+
+    lower: list[float] | None
+    upper: list[float] | None
+    deadline_ms: float | None
+
+
+# --- in: checks before the bytes are touched ----------------------------------------------------------------
+
+
+def check_size(n_bytes: int, limit: int, what: str) -> None:
+    """Refuse a payload by its length alone.
+
+    Raises:
+        TooLargeError: it is longer than the limit.
+    """
+    if n_bytes > limit:
+        raise TooLargeError(f"{what} of {n_bytes} bytes, the limit is {limit}")
+
+
+def check_encoding(encoding: str | None, kind: type[messages.Message]) -> None:
+    """Refuse a payload that says it is something else; a sender that says nothing is taken at its word.
+
+    Raises:
+        BadMessageError: the encoding names another schema.
+    """
+    expected = wire.encoding_of(kind)
+    if encoding not in (None, "", _UNSET_ENCODING, expected):
+        raise BadMessageError(f"the encoding is {encoding[:80]!r}, need {expected!r}")
+
+
+def check_robot_id(robot_id: str, allowed: frozenset[str]) -> None:
+    """Refuse robots that have no legal id, or are not on the list; an empty list allows all.
+
+    Raises:
+        UnknownRobotError: either of the two.
+    """
+    try:
+        keys.check_id(robot_id, "robot")
+    except ValueError as error:
+        raise UnknownRobotError(str(error)[:200]) from error
+    if allowed and robot_id not in allowed:
+        raise UnknownRobotError(f"robot {robot_id!r} is not on the allow list")
+
+
+# --- in: clouds and poses -----------------------------------------------------------------------------------
+
+
+class _CloudHead(messages.Message, frozen=True, kw_only=True):
+    schema = messages.Cloud.schema
+    seq: messages.Sequence
+    robot: messages.Identifier | None = None
+
+
+def decode_cloud_head(payload: bytes) -> CloudHead:
+    """The number and sender of a cloud; `UNKNOWN_SEQ` when even they cannot be read."""
+    try:
+        head = wire.decode(payload, _CloudHead)
+    except wire.WireError:
+        return CloudHead(UNKNOWN_SEQ, None)
+    return CloudHead(head.seq, head.robot)
+
+
+def decode_cloud(
+    payload: bytes,
+    *,
+    robot_id: str | None,
+    limits: Limits,
+    pose_at: Callable[[str, int], Float64],
+) -> Scan:
+    """A scan from the payload of `in/<robot>/cloud` or `q/integrate`.
+
+    Args:
+        payload: A `messages.Cloud`.
+        robot_id: From the key; None where the message must say it.
+        limits: Bounds on bytes, points and coordinates.
+        pose_at: Called with robot and stamp when the cloud brings no pose.
+    Raises:
+        BadMessageError: not a cloud, or its robot is missing or not the key's.
+        ShapeError: an array has the wrong dtype, shape or byte count.
+        TooLargeError: too many bytes or points.
+        EmptyError: no points.
+        BadPointsError: NaN or infinite coordinates.
+        OutOfRangeError: coordinates beyond the map's bounds, in the sensor frame or after the pose.
+        BadPoseError: not rigid, or not finite.
+        NoPoseError: no pose, and none at the stamp.
+    """
+    cloud = _decode(payload, messages.Cloud, limits.max_cloud_bytes)
+    if robot_id is None:
+        if cloud.robot is None:
+            raise BadMessageError("pot.cloud.v1: q/integrate needs the field `robot`")
+        robot_id = cloud.robot
+    elif cloud.robot not in (None, robot_id):
+        raise BadMessageError(
+            f"pot.cloud.v1: the cloud says robot {cloud.robot!r}, its key says {robot_id!r}"
+        )
+
+    points = _decode_array(cloud.points, "points", _FLOATS, (None, (2, 3)))
+    n = len(points)
+    if n > limits.max_cloud_points:
+        raise TooLargeError(f"cloud of {n} points, the limit is {limits.max_cloud_points}")
+    if n == 0:
+        raise EmptyError("the cloud has no points")
+    is_return = (
+        np.ones(n, np.bool_)
+        if cloud.is_return is None
+        else _decode_array(cloud.is_return, "is_return", (DType.BOOL,), (n,))
+    )
+    _check_coordinates(points, limits.max_coordinate_m, "points")
+    is_planar = points.shape[1] == 2
+    xyz = np.zeros((n, 3), np.float32)
+    xyz[:, : points.shape[1]] = points
+
+    pose = (
+        pose_at(robot_id, cloud.stamp_ns)
+        if cloud.T_map_sensor is None
+        else _decode_array(cloud.T_map_sensor, "T_map_sensor", (DType.FLOAT64,), (4, 4))
+    )
+    check_rigid(pose)
+    _check_placed(xyz, pose, limits.max_coordinate_m)
+    return Scan(
+        robot_id=robot_id,
+        seq=cloud.seq,
+        stamp_ns=cloud.stamp_ns,
+        points=xyz,
+        is_return=is_return,
+        T_map_sensor=pose,
+        is_planar=is_planar,
+    )
+
+
+def decode_pose(payload: bytes, *, max_bytes: int = 4096) -> tuple[int, Float64]:
+    """Stamp and (4, 4) matrix of one pose of a pose stream.
+
+    Raises:
+        BadMessageError, ShapeError, BadPoseError: see `decode_cloud`.
+    """
+    pose = _decode(payload, messages.Pose, max_bytes)
+    matrix = _decode_array(pose.T_map_sensor, "T_map_sensor", (DType.FLOAT64,), (4, 4))
+    check_rigid(matrix)
+    return pose.stamp_ns, matrix
+
+
+def _check_coordinates(points: NDArray[np.floating[Any]], max_coordinate_m: float, what: str) -> None:
+    """One pass over the array when all is well: NaN and infinity survive a maximum."""
+    with np.errstate(invalid="ignore"):
+        extent = float(np.abs(points).max(initial=0.0))
+    if extent <= max_coordinate_m:
+        return
+    bad = int((~np.isfinite(points)).any(axis=1).sum())
+    if bad:
+        raise BadPointsError(f"{bad} of {len(points)} {what} have NaN or infinite coordinates")
+    raise OutOfRangeError(f"{what} reach {extent:.6g} m, the limit is {max_coordinate_m:.6g} m")
+
+
+def _check_placed(points: NDArray[np.float32], pose: Float64, max_coordinate_m: float) -> None:
+    """Bound the map-frame coordinates; exact only when the cheap bound does not already settle it."""
+    reach = math.sqrt(3) * float(np.abs(points).max())
+    if float(np.abs(pose[:3, 3]).max()) + reach <= max_coordinate_m:
+        return
+    placed = points.astype(np.float64) @ pose[:3, :3].T + pose[:3, 3]
+    extent = max(float(np.abs(placed).max()), float(np.abs(pose[:3, 3]).max()))
+    if extent > max_coordinate_m:
+        raise OutOfRangeError(
+            f"the placed cloud reaches {extent:.6g} m, the limit is {max_coordinate_m:.6g} m"
+        )
+
+
+# --- in: queries --------------------------------------------------------------------------------------------
+
+
+def decode_points_query(payload: bytes, limits: Limits) -> PointsRequest:
+    """Points to ask at.
+
+    Raises:
+        BadMessageError, ShapeError: see `decode_cloud`.
+        TooLargeError: too many bytes or points.
+        BadPointsError, OutOfRangeError: coordinates.
+    """
+    query = _decode(payload, messages.PointsQuery, limits.max_query_bytes)
+    points = _decode_array(query.points, "points", _FLOATS, (None, (2, 3)))
+    if len(points) > limits.max_query_points:
+        raise TooLargeError(f"query of {len(points)} points, the limit is {limits.max_query_points}")
+    _check_coordinates(points, limits.max_coordinate_m, "points")
+    return PointsRequest(points, query.deadline_ms)
+
+
+def decode_grid_query(payload: bytes) -> GridRequest:
+    """A box and a resolution; the query service judges the values.
+
+    Raises:
+        BadMessageError: not this message.
+    """
+    query = _decode(payload, messages.GridQuery)
+    return GridRequest(query.lower, query.upper, query.resolution, query.deadline_ms)
+
+
+def decode_params_query(payload: bytes) -> ParamsRequest:
+    """A box, or none for the whole map; the query service judges the values.
+
+    Raises:
+        BadMessageError: not this message.
+    """
+    query = _decode(payload, messages.ParamsQuery)
+    return ParamsRequest(query.lower, query.upper, query.deadline_ms)
+
+
+def decode_atoms_query(payload: bytes) -> str | None:
+    """The atom that is asked for; None asks for the list."""
+    return _decode(payload, messages.AtomsQuery).atom_id
+
+
+def decode_info_query(payload: bytes) -> None:
+    """Nothing to read, but it must be that message."""
+    _decode(payload, messages.InfoQuery)
+
+
+def decode_stats_query(payload: bytes) -> None:
+    """Nothing to read, but it must be that message."""
+    _decode(payload, messages.StatsQuery)
+
+
+def decode_control(payload: bytes) -> float | None:
+    """How long the asker waits for a control verb, in seconds."""
+    return _decode(payload, messages.ControlRequest).timeout_s
+
+
+def _decode(payload: bytes, kind: type[MessageT], max_bytes: int = _MAX_SMALL_BYTES) -> MessageT:
+    """One message; an empty payload stands for a message whose fields all have defaults."""
+    with _typed_errors():
+        return wire.decode(payload or b"\x80", kind, wire.WireLimits(max_bytes=max_bytes))
+
+
+def _decode_array(
+    array: messages.Array,
+    name: str,
+    dtypes: tuple[DType, ...],
+    shape: tuple[int | tuple[int, ...] | None, ...],
+) -> NDArray[Any]:
+    with _typed_errors():
+        return wire.decode_array(array, name, dtypes=dtypes, shape=shape)
+
+
+@contextlib.contextmanager
+def _typed_errors() -> Iterator[None]:
+    try:
+        yield
+    except wire.WireError as error:
+        raise _ERRORS[error.code.value](str(error)) from error
+
+
+# --- out: receipts and events -------------------------------------------------------------------------------
+
+
+def accepted_receipt(
+    *,
+    map_id: str,
+    scan: Scan,
+    update: MapUpdate,
+    kernels: messages.Kernels | None,
+    queue_depth: int,
+    wait_ms: float,
+    integrate_ms: float,
+) -> Wire:
+    """The receipt of a cloud that is in the map; with its kernels for `q/integrate`."""
+    return _wire(
+        messages.Receipt(
+            map=map_id,
+            robot=scan.robot_id,
+            seq=scan.seq,
+            status=messages.ReceiptStatus.ACCEPTED,
+            queue_depth=queue_depth,
+            wait_ms=wait_ms,
+            integrate_ms=integrate_ms,
+            map_revision=update.map_revision,
+            n_points=update.n_points,
+            n_kernels=len(update.kernels),
+            n_kernels_added=update.n_kernels_added,
+            map_kernels=update.map_kernels,
+            sectors=_sectors(update.sectors),
+            kernels=kernels,
+        )
+    )
+
+
+def refused_receipt(
+    *,
+    map_id: str,
+    robot_id: str,
+    seq: int,
+    error: PotserverError,
+    queue_depth: int,
+    wait_ms: float,
+    map_revision: int,
+    map_kernels: int,
+) -> Wire:
+    """The receipt of a cloud that is not in the map."""
+    return _wire(
+        messages.Receipt(
+            map=map_id,
+            robot=robot_id,
+            seq=seq,
+            status=refusal(error),
+            reason=error.code,
+            message=str(error),
+            queue_depth=queue_depth,
+            wait_ms=wait_ms,
+            map_revision=map_revision,
+            map_kernels=map_kernels,
+        )
+    )
+
+
+def refusal(error: PotserverError) -> messages.ReceiptStatus:
+    """`dropped` for load and shutdown, `rejected` for everything that would fail again."""
+    return messages.ReceiptStatus.DROPPED if error.retryable else messages.ReceiptStatus.REJECTED
+
+
+def encode_params(
+    *, map_id: str, scan: Scan, update: MapUpdate, observed_activation: float, prior_var: float
+) -> Wire:
+    """The transported parameters of one cloud."""
+    return _wire(
+        messages.Params(
+            map=map_id,
+            robot=scan.robot_id,
+            seq=scan.seq,
+            stamp_ns=scan.stamp_ns,
+            map_revision=update.map_revision,
+            kernels=encode_kernels(
+                update.kernels, observed_activation=observed_activation, prior_var=prior_var
+            ),
+            sectors=_sectors(update.sectors),
+        )
+    )
+
+
+def encode_revision(*, map_id: str, update: MapUpdate, stamp_ns: int) -> Wire:
+    """The tick of `ev/revision`."""
+    return _wire(
+        messages.Revision(
+            map=map_id,
+            map_revision=update.map_revision,
+            stamp_ns=stamp_ns,
+            n_kernels=update.map_kernels,
+            tile_size_m=float(update.changed.tile_size_m),
+            changed_tiles=[[int(i) for i in tile] for tile in update.changed.tiles],
+        )
+    )
+
+
+def _sectors(matches: list[SectorMatch]) -> list[messages.SectorReport]:
+    return [
+        messages.SectorReport(
+            azimuth_min_rad=float(m.azimuth_min_rad),
+            azimuth_max_rad=float(m.azimuth_max_rad),
+            n_hits=int(m.n_hits),
+            n_free=int(m.n_free),
+            atom_id=m.atom_id,
+            rotation_rad=float(m.rotation_rad),
+            w2_m2=float(m.w2_m2),
+            n_kernels=int(m.n_kernels),
+            converged=bool(m.converged),
+            marginal_error=float(m.marginal_error),
+            n_iterations=int(m.n_iterations),
+            reason=m.reason,
+        )
+        for m in matches
+    ]
+
+
+# --- out: maps and answers ----------------------------------------------------------------------------------
+
+
+def encode_kernels(kernels: KernelSet, *, observed_activation: float, prior_var: float) -> messages.Kernels:
+    """Kernels for the wire: float64 positions become float32 offsets from their centroid, in whole metres."""
+    origin = np.round(kernels.hinge_mean.mean(axis=0)) if len(kernels) else np.zeros(3)
+    return messages.Kernels(
+        origin=[float(c) for c in origin],
+        hinge_mean=_float32(kernels.hinge_mean - origin),
+        hinge_var=_float32(kernels.hinge_var),
+        gamma_shape=_float32(kernels.gamma_shape),
+        gamma_rate=_float32(kernels.gamma_rate),
+        weight_mean=_float32(kernels.weight_mean),
+        weight_var=_float32(kernels.weight_var),
+        observed_activation=float(observed_activation),
+        prior_var=float(prior_var),
+    )
+
+
+def encode_occupancy(occupancy: Occupancy) -> Wire:
+    """The reply to `q/points`."""
+    return _wire(_occupancy(occupancy))
+
+
+def encode_grid_part(
+    *,
+    part: int,
+    n_parts: int,
+    shape: tuple[int, int, int],
+    first_cell: int,
+    lower: Sequence[float],
+    resolution: float,
+    occupancy: Occupancy,
+) -> Wire:
+    """One part of the reply to `q/grid`."""
+    return _wire(
+        messages.GridPart(
+            part=part,
+            n_parts=n_parts,
+            shape=[int(n) for n in shape],
+            first_cell=int(first_cell),
+            lower=[float(c) for c in lower],
+            resolution=float(resolution),
+            occupancy=_occupancy(occupancy),
+        )
+    )
+
+
+def encode_params_part(
+    *,
+    part: int,
+    n_parts: int,
+    map_revision: int,
+    kernels: KernelSet,
+    observed_activation: float,
+    prior_var: float,
+) -> Wire:
+    """One part of the reply to `q/params`."""
+    return _wire(
+        messages.ParamsPart(
+            part=part,
+            n_parts=n_parts,
+            map_revision=map_revision,
+            kernels=encode_kernels(kernels, observed_activation=observed_activation, prior_var=prior_var),
+        )
+    )
+
+
+def encode_atom_list(atoms: Sequence[Atom], usage: Mapping[str, int]) -> Wire:
+    """The dictionary's table."""
+    return _wire(messages.AtomList(atoms=[_atom_info(atom, usage) for atom in atoms]))
+
+
+def encode_atom(
+    atom: Atom, usage: Mapping[str, int], *, observed_activation: float, prior_var: float
+) -> Wire:
+    """One atom whole."""
+    return _wire(
+        messages.Atom(
+            info=_atom_info(atom, usage),
+            hit_points=_float32(atom.hit_points),
+            free_points=_float32(atom.free_points),
+            kernels=encode_kernels(
+                atom.kernels, observed_activation=observed_activation, prior_var=prior_var
+            ),
+        )
+    )
+
+
+def encode_info(
+    *,
+    server_id: str,
+    version: str,
+    map_id: str,
+    maps: Sequence[str],
+    profile: str,
+    snapshot: Snapshot,
+    n_atoms: int,
+    n_scans: int,
+    tile_size_m: float,
+    max_range_m: float,
+    limits: Limits,
+    started_ns: int,
+) -> Wire:
+    """What this server is and what this map holds."""
+    hinges = snapshot.kernels.hinge_mean
+    return _wire(
+        messages.Info(
+            server=server_id,
+            version=version,
+            map=map_id,
+            maps=list(maps),
+            profile=profile,
+            map_revision=snapshot.map_revision,
+            n_kernels=len(hinges),
+            n_atoms=n_atoms,
+            n_scans=n_scans,
+            lower=[float(c) for c in hinges.min(axis=0)] if len(hinges) else None,
+            upper=[float(c) for c in hinges.max(axis=0)] if len(hinges) else None,
+            tile_size_m=float(tile_size_m),
+            observed_activation=float(snapshot.observed_activation),
+            prior_var=float(snapshot.prior_var),
+            limits=messages.Limits(
+                max_cloud_bytes=limits.max_cloud_bytes,
+                max_cloud_points=limits.max_cloud_points,
+                max_query_bytes=limits.max_query_bytes,
+                max_query_points=limits.max_query_points,
+                max_grid_cells=limits.max_grid_cells,
+                max_range_m=float(max_range_m),
+                max_coordinate_m=limits.max_coordinate_m,
+            ),
+            started_ns=started_ns,
+        )
+    )
+
+
+def encode_stats(
+    *,
+    server_id: str,
+    stamp_ns: int,
+    uptime_s: float,
+    state: str,
+    counters: dict[str, int],
+    queues: dict[str, int],
+    latencies: Mapping[str, Latency],
+    rss_bytes: int,
+    map_kernels: dict[str, int],
+) -> Wire:
+    """The server's counters."""
+    return _wire(
+        messages.Stats(
+            server=server_id,
+            stamp_ns=stamp_ns,
+            uptime_s=uptime_s,
+            state=state,
+            counters=counters,
+            queues=queues,
+            latencies={
+                kind: messages.LatencySummary(
+                    count=summary.n,
+                    p50_ms=summary.p50_ms,
+                    p95_ms=summary.p95_ms,
+                    p99_ms=summary.p99_ms,
+                    max_ms=summary.max_ms,
+                )
+                for kind, summary in latencies.items()
+            },
+            rss_bytes=rss_bytes,
+            map_kernels=map_kernels,
+        )
+    )
+
+
+def encode_control_reply(*, verb: str, map_revision: int, message: str) -> Wire:
+    """A control verb was carried out."""
+    return _wire(messages.ControlReply(verb=verb, map_revision=map_revision, message=message))
+
+
+def encode_error(error: PotserverError) -> Wire:
+    """The payload of `reply_err`."""
+    return _wire(
+        messages.ErrorReply(
+            code=ErrorCode(error.code),
+            message=str(error),
+            retryable=error.retryable,
+            retry_after_s=error.retry_after_s,
+        )
+    )
+
+
+def _atom_info(atom: Atom, usage: Mapping[str, int]) -> messages.AtomInfo:
+    return messages.AtomInfo(
+        atom_id=atom.atom_id,
+        dims=atom.dims,
+        n_hits=len(atom.hit_points),
+        n_free=len(atom.free_points),
+        n_kernels=len(atom.kernels),
+        radius_m=float(atom.radius_m),
+        azimuth_width_rad=float(atom.azimuth_width_rad),
+        times_used=int(usage.get(atom.atom_id, 0)),
+        provenance={str(k): str(v) for k, v in atom.provenance.items()},
+    )
+
+
+def _occupancy(occupancy: Occupancy) -> messages.Occupancy:
+    return messages.Occupancy(
+        mean=_float32(np.minimum(occupancy.mean, _BELOW_ONE)),
+        var=_float32(occupancy.var),
+        latent_mean=_float32(occupancy.latent_mean),
+        latent_var=_float32(occupancy.latent_var),
+        observed=wire.encode_array(occupancy.observed),
+        map_revision=occupancy.map_revision,
+    )
+
+
+def _float32(array: NDArray[np.floating[Any]]) -> messages.Array:
+    return wire.encode_array(np.asarray(array, np.float32))
+
+
+def _wire(message: messages.Message) -> Wire:
+    return Wire(wire.encode(message), wire.encoding_of(message))

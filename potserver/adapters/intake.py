@@ -1,0 +1,228 @@
+"""Clouds waiting for the mapper: bounded by count and bytes, fair between robots, in order within a robot."""
+
+from __future__ import annotations
+
+import collections
+import dataclasses
+import threading
+import time
+from collections.abc import Callable
+from typing import NamedTuple
+
+import zenoh
+
+from potserver.adapters.ports import Payload
+from potserver.errors import OverloadedError, PotserverError, ShuttingDownError
+
+INTEGRATE_LANE = ""  # all `q/integrate` clouds: whose they are is only known once they are decoded
+_MAX_BARRIERS = 16
+
+
+@dataclasses.dataclass(slots=True, eq=False, kw_only=True)
+class CloudJob:
+    """One cloud, not decoded yet."""
+
+    robot_id: str | None  # from the key; None: `q/integrate`, the message says it
+    payload: Payload
+    query: zenoh.Query | None = None  # `q/integrate` only: the receipt is its reply
+    arrived_s: float = dataclasses.field(default_factory=time.monotonic)
+    n_bytes: int = dataclasses.field(init=False)
+
+    def __post_init__(self) -> None:
+        self.n_bytes = len(self.payload)
+
+    @property
+    def lane(self) -> str:
+        """What fairness is between."""
+        return INTEGRATE_LANE if self.robot_id is None else self.robot_id
+
+    def wait_ms(self) -> float:
+        """Time since the cloud arrived."""
+        return (time.monotonic() - self.arrived_s) * 1e3
+
+
+class Barrier(NamedTuple):
+    """Work for the writer thread that comes after every cloud admitted before it."""
+
+    run: Callable[[], None]
+    refuse: Callable[[PotserverError], None]
+
+
+class Refusal(NamedTuple):
+    """A cloud that will not be mapped, and why."""
+
+    job: CloudJob
+    error: PotserverError
+
+
+@dataclasses.dataclass(slots=True, eq=False)
+class _Epoch:
+    """Clouds between two barriers; the lane at the front is next."""
+
+    lanes: collections.OrderedDict[str, collections.deque[CloudJob]] = dataclasses.field(
+        default_factory=collections.OrderedDict
+    )
+    barrier: Barrier | None = None  # once all lanes are empty
+
+
+class IntakeQueue:
+    """Many producers that never wait, one consumer: the map's writer.
+
+    When it is full, the newest cloud of the robot that holds most places makes room for a robot that holds at
+    least two fewer; otherwise the newcomer is refused. Either way somebody is told at once.
+
+    Args:
+        max_queued: Clouds.
+        max_queued_bytes: Bytes of all of them.
+        retry_after_s: What a refused sender is advised to wait.
+    """
+
+    def __init__(self, *, max_queued: int, max_queued_bytes: int, retry_after_s: float = 0.5) -> None:
+        self._max_queued, self._max_bytes, self._retry_after_s = max_queued, max_queued_bytes, retry_after_s
+        self._changed = threading.Condition()
+        self._epochs: collections.deque[_Epoch] = collections.deque([_Epoch()])
+        self._counts: collections.Counter[str] = collections.Counter()
+        self._n_bytes = 0
+        self._busy = False
+        self._admitting, self._closed = True, False
+
+    @property
+    def depth(self) -> int:
+        """Clouds waiting, without the one in work."""
+        with self._changed:
+            return self._counts.total()
+
+    @property
+    def n_bytes(self) -> int:
+        """Bytes waiting."""
+        with self._changed:
+            return self._n_bytes
+
+    @property
+    def is_admitting(self) -> bool:
+        """False once the map drains."""
+        with self._changed:
+            return self._admitting
+
+    def admit(self, job: CloudJob) -> list[Refusal]:
+        """Queue a cloud.
+
+        Returns:
+            The clouds that lost their place, perhaps this one; the caller must send their receipts.
+        """
+        with self._changed:
+            if not self._admitting:
+                return [Refusal(job, ShuttingDownError("the server takes no more clouds"))]
+            refused = []
+            while (
+                self._counts.total() + 1 > self._max_queued or self._n_bytes + job.n_bytes > self._max_bytes
+            ):
+                victim = self._newest_of_heaviest(job.lane)
+                refused.append(Refusal(victim or job, self._overloaded()))
+                if victim is None:
+                    return refused
+                self._forget(victim)
+            self._epochs[-1].lanes.setdefault(job.lane, collections.deque()).append(job)
+            self._counts[job.lane] += 1
+            self._n_bytes += job.n_bytes
+            self._changed.notify_all()
+            return refused
+
+    def admit_barrier(self, barrier: Barrier) -> None:
+        """Queue work that follows all clouds queued so far.
+
+        Raises:
+            OverloadedError: too many barriers wait already.
+            ShuttingDownError: the queue is closed.
+        """
+        with self._changed:
+            if self._closed:
+                raise ShuttingDownError("the server is closing")
+            if len(self._epochs) > _MAX_BARRIERS:
+                raise OverloadedError(
+                    f"{_MAX_BARRIERS} control requests wait already", retry_after_s=self._retry_after_s
+                )
+            self._epochs[-1].barrier = barrier
+            self._epochs.append(_Epoch())
+            self._changed.notify_all()
+
+    def take(self) -> CloudJob | Barrier | None:
+        """Wait for work, robot by robot; None when the queue is closed. Call `done` after each."""
+        with self._changed:
+            while not self._closed:
+                epoch = self._epochs[0]
+                if epoch.lanes:
+                    lane, jobs = epoch.lanes.popitem(last=False)
+                    job = jobs.popleft()
+                    if jobs:
+                        epoch.lanes[lane] = jobs  # to the back: the next robot is next
+                    self._drop_counts(job)
+                    self._busy = True
+                    return job
+                if epoch.barrier is not None:
+                    self._epochs.popleft()
+                    self._busy = True
+                    return epoch.barrier
+                self._changed.wait()
+            return None
+
+    def done(self) -> None:
+        """The work that `take` gave is finished."""
+        with self._changed:
+            self._busy = False
+            self._changed.notify_all()
+
+    def stop_admitting(self) -> None:
+        """Refuse all further clouds; those queued are still worked off."""
+        with self._changed:
+            self._admitting = False
+
+    def wait_idle(self, timeout_s: float) -> bool:
+        """Wait until nothing is queued or in work; False if that took too long."""
+        with self._changed:
+            return self._changed.wait_for(
+                lambda: not (self._busy or self._counts.total() or len(self._epochs) > 1), timeout_s
+            )
+
+    def close(self) -> tuple[list[CloudJob], list[Barrier]]:
+        """End `take`, and hand back what is left; the caller must refuse each."""
+        with self._changed:
+            self._admitting, self._closed = False, True
+            clouds = [job for epoch in self._epochs for jobs in epoch.lanes.values() for job in jobs]
+            barriers = [epoch.barrier for epoch in self._epochs if epoch.barrier is not None]
+            self._epochs = collections.deque([_Epoch()])
+            self._counts.clear()
+            self._n_bytes = 0
+            self._changed.notify_all()
+            return clouds, barriers
+
+    def _overloaded(self) -> OverloadedError:
+        return OverloadedError(
+            f"the queue holds {self._counts.total()} clouds of {self._n_bytes} bytes;"
+            f" the limits are {self._max_queued} and {self._max_bytes}",
+            retry_after_s=self._retry_after_s,
+        )
+
+    def _newest_of_heaviest(self, newcomer: str) -> CloudJob | None:
+        if not self._counts:
+            return None
+        lane, count = self._counts.most_common(1)[0]
+        if count < self._counts[newcomer] + 2:
+            return None
+        return next(epoch.lanes[lane][-1] for epoch in reversed(self._epochs) if lane in epoch.lanes)
+
+    def _forget(self, job: CloudJob) -> None:
+        for epoch in self._epochs:
+            jobs = epoch.lanes.get(job.lane)
+            if jobs and job in jobs:
+                jobs.remove(job)
+                if not jobs:
+                    del epoch.lanes[job.lane]
+                break
+        self._drop_counts(job)
+
+    def _drop_counts(self, job: CloudJob) -> None:
+        self._counts[job.lane] -= 1
+        if not self._counts[job.lane]:
+            del self._counts[job.lane]
+        self._n_bytes -= job.n_bytes

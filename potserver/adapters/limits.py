@@ -1,0 +1,23 @@
+"""What the server accepts. One plain record, so that settings, checks and `q/info` cannot disagree."""
+
+from __future__ import annotations
+
+import dataclasses
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class Limits:
+    """Every bound on what comes in; each is a setting in the `[limits]` table."""
+
+    max_cloud_bytes: int = 8 * 2**20
+    max_cloud_points: int = 400_000
+    max_query_bytes: int = 4 * 2**20
+    max_query_points: int = 200_000
+    max_grid_cells: int = 20_000_000
+    max_coordinate_m: float = 2.0e7  # each coordinate in the map frame; UTM northings end at 1e7
+    max_robots: int = 1024  # robots remembered at once: stamps, poses, presence
+
+    @property
+    def wire_guard_bytes(self) -> int:
+        """Size at which Zenoh itself drops a message, silently: far above what gets a typed error from us."""
+        return 4 * max(self.max_cloud_bytes, self.max_query_bytes)

@@ -1,0 +1,60 @@
+"""Poses published on `in/<robot>/pose`."""
+
+from __future__ import annotations
+
+import zenoh
+
+from potschemas import keys, messages
+from potserver.adapters import codec
+from potserver.adapters.log import get_logger
+from potserver.adapters.poses import PoseBuffer
+from potserver.errors import PotserverError
+from potserver.services.health import Health
+
+log = get_logger("potserver.poses")
+
+_MAX_POSE_BYTES = 4096
+_NEWEST_KEPT = 256  # a burst beyond this loses its oldest poses; interpolation bridges the hole
+
+
+class PoseSubscriber:
+    """Fills the pose buffer."""
+
+    def __init__(
+        self,
+        session: zenoh.Session,
+        map_keys: keys.MapKeys,
+        *,
+        poses: PoseBuffer,
+        health: Health,
+        allowed_robots: frozenset[str],
+    ) -> None:
+        self._poses, self._health, self._allowed_robots = poses, health, allowed_robots
+        self._subscriber = session.declare_subscriber(
+            map_keys.pose("*"), zenoh.handlers.RingChannel(_NEWEST_KEPT)
+        )
+
+    def run(self) -> None:
+        """Take samples until undeclared, on a thread of our own."""
+        for sample in self._subscriber:
+            try:
+                self._add(sample)
+                self._health.count("poses.accepted")
+            except PotserverError as error:
+                self._health.count(f"poses.rejected.{error.code}")
+                log.debug("pose_refused", key=str(sample.key_expr), reason=error.code, detail=str(error))
+            except Exception:
+                log.exception("pose_failed", key=str(sample.key_expr))
+                self._health.count("poses.rejected.internal")
+
+    def undeclare(self) -> None:
+        """Take no more; ends `run`."""
+        self._subscriber.undeclare()
+
+    def _add(self, sample: zenoh.Sample) -> None:
+        self._health.count("poses.received")
+        robot_id = keys.robot_of(str(sample.key_expr))
+        codec.check_robot_id(robot_id, self._allowed_robots)
+        codec.check_encoding(str(sample.encoding), messages.Pose)
+        codec.check_size(len(sample.payload), _MAX_POSE_BYTES, "pose")
+        self._poses.add(robot_id, *codec.decode_pose(sample.payload.to_bytes()))

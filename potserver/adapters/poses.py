@@ -1,0 +1,148 @@
+"""Poses of the robots' pose streams, and the pose at a cloud's stamp."""
+
+from __future__ import annotations
+
+import bisect
+import collections
+import threading
+import time
+
+import numpy as np
+from numpy.typing import NDArray
+
+from potserver.domain.types import Float64, check_rigid
+from potserver.errors import NoPoseError
+
+
+class PoseBuffer:
+    """The last poses of every robot, bounded in robots and in poses a robot.
+
+    Args:
+        max_per_robot: Poses kept; 1024 are 20 s at 50 Hz.
+        max_robots: Robots kept; the one that has been silent longest goes first.
+        max_gap_s: Two poses further apart than this are not interpolated between.
+    """
+
+    def __init__(self, *, max_per_robot: int = 1024, max_robots: int = 1024, max_gap_s: float = 0.5) -> None:
+        self._max_per_robot, self._max_robots = max_per_robot, max_robots
+        self._max_gap_ns = int(max_gap_s * 1e9)
+        self._changed = threading.Condition()
+        self._tracks: collections.OrderedDict[str, _Track] = collections.OrderedDict()
+
+    def add(self, robot_id: str, stamp_ns: int, T_map_sensor: Float64) -> None:
+        """Keep one pose; an older pose of the same stamp is replaced.
+
+        Raises:
+            BadPoseError: the pose is not rigid.
+        """
+        check_rigid(T_map_sensor)
+        with self._changed:
+            track = self._tracks.setdefault(robot_id, _Track())
+            self._tracks.move_to_end(robot_id)
+            if len(self._tracks) > self._max_robots:
+                self._tracks.popitem(last=False)
+            track.insert(stamp_ns, T_map_sensor, self._max_per_robot)
+            self._changed.notify_all()
+
+    def at(self, robot_id: str, stamp_ns: int, *, wait_s: float = 0.0) -> Float64:
+        """(4, 4) pose at a stamp, interpolated between its two neighbours.
+
+        Args:
+            robot_id: Whose stream.
+            stamp_ns: When.
+            wait_s: How long to wait for the stream to reach the stamp; a robot without a stream is not waited
+                for.
+        Raises:
+            NoPoseError: no stream, the stamp is outside the buffer, or its neighbours are too far apart.
+        """
+        deadline = time.monotonic() + wait_s
+        with self._changed:
+            while True:
+                track = self._tracks.get(robot_id)
+                if track is None:
+                    raise NoPoseError(f"the cloud has no pose, and {robot_id} has sent no pose stream")
+                if stamp_ns <= track.stamps[-1]:
+                    return track.at(stamp_ns, self._max_gap_ns)
+                if not self._changed.wait(deadline - time.monotonic()):
+                    late_ms = (stamp_ns - track.stamps[-1]) / 1e6
+                    raise NoPoseError(
+                        f"the cloud has no pose, and the stream of {robot_id} ends {late_ms:.1f} ms before it"
+                    )
+
+
+class _Track:
+    def __init__(self) -> None:
+        self.stamps: list[int] = []
+        self.poses: list[Float64] = []
+
+    def insert(self, stamp_ns: int, pose: Float64, max_poses: int) -> None:
+        i = bisect.bisect_left(self.stamps, stamp_ns)
+        if i < len(self.stamps) and self.stamps[i] == stamp_ns:
+            self.poses[i] = pose
+            return
+        self.stamps.insert(i, stamp_ns)
+        self.poses.insert(i, pose)
+        if len(self.stamps) > max_poses:
+            del self.stamps[0], self.poses[0]
+
+    def at(self, stamp_ns: int, max_gap_ns: int) -> Float64:
+        after = bisect.bisect_left(self.stamps, stamp_ns)
+        if self.stamps[after] == stamp_ns:
+            return self.poses[after]
+        if after == 0:
+            early_ms = (self.stamps[0] - stamp_ns) / 1e6
+            raise NoPoseError(f"the cloud is {early_ms:.1f} ms older than the oldest pose kept")
+        before = after - 1
+        gap_ns = self.stamps[after] - self.stamps[before]
+        if gap_ns > max_gap_ns:
+            raise NoPoseError(f"the poses around the cloud's stamp are {gap_ns / 1e6:.0f} ms apart")
+        return interpolate(self.poses[before], self.poses[after], (stamp_ns - self.stamps[before]) / gap_ns)
+
+
+def interpolate(start: Float64, end: Float64, fraction: float) -> Float64:
+    """A pose between two: linear in translation, along the great circle in rotation (slerp)."""
+    q0, q1 = _quaternion(start[:3, :3]), _quaternion(end[:3, :3])
+    cosine = float(q0 @ q1)
+    if cosine < 0:  # the shorter way round
+        q1, cosine = -q1, -cosine
+    angle = float(np.arccos(min(1.0, cosine)))
+    if angle < 1e-6:
+        q = (1 - fraction) * q0 + fraction * q1
+    else:
+        q = (np.sin((1 - fraction) * angle) * q0 + np.sin(fraction * angle) * q1) / np.sin(angle)
+    pose = np.eye(4)
+    pose[:3, :3] = _rotation(q / np.linalg.norm(q))
+    pose[:3, 3] = (1 - fraction) * start[:3, 3] + fraction * end[:3, 3]
+    return pose
+
+
+def _quaternion(R: NDArray[np.float64]) -> Float64:
+    """(w, x, y, z) of a rotation: the best conditioned of the four ways."""
+    w2 = np.array(
+        [
+            1 + R[0, 0] + R[1, 1] + R[2, 2],
+            1 + R[0, 0] - R[1, 1] - R[2, 2],
+            1 - R[0, 0] + R[1, 1] - R[2, 2],
+            1 - R[0, 0] - R[1, 1] + R[2, 2],
+        ]
+    )
+    i = int(np.argmax(w2))
+    rows = (
+        (w2[0], R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]),
+        (R[2, 1] - R[1, 2], w2[1], R[1, 0] + R[0, 1], R[0, 2] + R[2, 0]),
+        (R[0, 2] - R[2, 0], R[1, 0] + R[0, 1], w2[2], R[2, 1] + R[1, 2]),
+        (R[1, 0] - R[0, 1], R[0, 2] + R[2, 0], R[2, 1] + R[1, 2], w2[3]),
+    )
+    q = np.array(rows[i])
+    return np.asarray(q / np.linalg.norm(q))
+
+
+def _rotation(q: Float64) -> Float64:
+    w, x, y, z = q
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )

@@ -1,0 +1,68 @@
+"""Who is there: our own tokens, and the robots'."""
+
+from __future__ import annotations
+
+import threading
+
+import zenoh
+
+from potschemas import keys
+from potserver.adapters.log import get_logger
+from potserver.errors import PotserverError
+
+log = get_logger("potserver.presence")
+
+
+class ServerToken:
+    """Says that this server serves a map and is warm, until undeclared or until the process dies."""
+
+    def __init__(self, session: zenoh.Session, map_keys: keys.MapKeys, server_id: str) -> None:
+        self._token = session.liveliness().declare_token(map_keys.server_token(server_id))
+
+    def undeclare(self) -> None:
+        """Say that no more work should come here."""
+        self._token.undeclare()
+
+
+class RobotWatch:
+    """Which robots hold a token for a map."""
+
+    def __init__(self, session: zenoh.Session, map_keys: keys.MapKeys, *, max_robots: int) -> None:
+        self._map_id, self._max_robots = map_keys.map_id, max_robots
+        self._lock = threading.Lock()
+        self._alive: set[str] = set()
+        self._subscriber = session.liveliness().declare_subscriber(
+            map_keys.robot_token("*"), zenoh.handlers.FifoChannel(64), history=True
+        )
+
+    @property
+    def n_alive(self) -> int:
+        """Robots with a token now."""
+        with self._lock:
+            return len(self._alive)
+
+    def run(self) -> None:
+        """Follow the tokens until undeclared, on a thread of our own."""
+        for sample in self._subscriber:
+            try:
+                self._note(sample)
+            except (PotserverError, ValueError) as error:
+                log.debug("robot_token_ignored", key=str(sample.key_expr), detail=str(error))
+
+    def undeclare(self) -> None:
+        """Follow no more; ends `run`."""
+        self._subscriber.undeclare()
+
+    def _note(self, sample: zenoh.Sample) -> None:
+        robot_id = keys.check_id(keys.robot_of(str(sample.key_expr)), "robot")
+        with self._lock:
+            if sample.kind == zenoh.SampleKind.DELETE:
+                known = robot_id in self._alive
+                self._alive.discard(robot_id)
+            else:
+                known = robot_id not in self._alive and len(self._alive) < self._max_robots
+                if known:
+                    self._alive.add(robot_id)
+        if known:
+            event = "robot_left" if sample.kind == zenoh.SampleKind.DELETE else "robot_joined"
+            log.info(event, map_id=self._map_id, robot_id=robot_id)

@@ -1,0 +1,390 @@
+"""What the server answers: `q/<op>` and `ctl/<verb>` of each map, and `srv/<server>/stats`.
+
+One complete queryable a key expression, so that Zenoh asks one server and not all. Threads of the
+declarations only admit; replies are sent by workers. Replies take the quality of service of their query, so
+the asker sets the lane.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections.abc import Callable, Iterator
+
+import numpy as np
+import zenoh
+
+from potschemas import keys, messages
+from potserver.adapters import codec
+from potserver.adapters.intake import Barrier, CloudJob, IntakeQueue
+from potserver.adapters.limits import Limits
+from potserver.adapters.log import get_logger
+from potserver.adapters.outbox import Outbox
+from potserver.adapters.ports import Asker, Mapper
+from potserver.adapters.query_pool import QueryJob, QueryPool
+from potserver.adapters.receipts import ReceiptSender
+from potserver.errors import DeadlineError, PotserverError, UnsupportedError
+from potserver.services.health import Health
+
+log = get_logger("potserver.queries")
+
+INTEGRATE = "integrate"
+_BACKLOG = 64  # queries between Zenoh and our admission; admission takes microseconds
+_BUG = "a bug of the server; the traceback is in its log"
+
+
+class MapQueryable:
+    """All `q/<op>` of one map."""
+
+    def __init__(
+        self,
+        session: zenoh.Session,
+        map_keys: keys.MapKeys,
+        *,
+        mapper: Mapper,
+        asker: Asker,
+        intake: IntakeQueue,
+        receipts: ReceiptSender,
+        pool: QueryPool,
+        health: Health,
+        limits: Limits,
+        grid_part_cells: int,
+        params_part_kernels: int,
+        encode_info: Callable[[], codec.Wire],
+    ) -> None:
+        self._keys = map_keys
+        self._mapper, self._asker = mapper, asker
+        self._intake, self._receipts, self._pool = intake, receipts, pool
+        self._health, self._limits = health, limits
+        self._grid_part_cells, self._params_part_kernels = grid_part_cells, params_part_kernels
+        self._encode_info = encode_info
+        self._ops: dict[
+            str, tuple[type[messages.Message], Callable[[bytes, float], Iterator[codec.Wire]]]
+        ] = {
+            "points": (messages.PointsQuery, self._points),
+            "grid": (messages.GridQuery, self._grid),
+            "params": (messages.ParamsQuery, self._params),
+            "atoms": (messages.AtomsQuery, self._atoms),
+            "info": (messages.InfoQuery, self._info),
+        }
+        self._queryable = session.declare_queryable(
+            map_keys.query("*"), zenoh.handlers.FifoChannel(_BACKLOG), complete=True
+        )
+
+    def run(self) -> None:
+        """Admit queries until undeclared, on a thread of our own."""
+        for query in self._queryable:
+            op = "unknown"
+            try:
+                self._health.count("queries.received")
+                op = self._admit(query)
+            except PotserverError as error:
+                self._refuse(query, _op_of(query, (INTEGRATE, *self._ops)) or op, error)
+            except Exception:
+                log.exception("query_admission_failed", key=str(query.key_expr))
+                self._refuse(query, op, PotserverError(_BUG))
+
+    def undeclare(self) -> None:
+        """Take no more; ends `run`."""
+        self._queryable.undeclare()
+
+    # --- admission ------------------------------------------------------------------------------------------
+
+    def _admit(self, query: zenoh.Query) -> str:
+        op = _op_of(query, (INTEGRATE, *self._ops))
+        if op is None:
+            raise UnsupportedError(
+                f"no operation {_last_chunk(query)!r}; ask for one of {', '.join((INTEGRATE, *self._ops))}"
+            )
+        n_bytes = len(query.payload) if query.payload is not None else 0
+        if op == INTEGRATE:
+            self._admit_cloud(query)
+            return op
+        kind, handler = self._ops[op]
+        codec.check_size(n_bytes, self._limits.max_query_bytes, f"{op} query")
+        codec.check_encoding(_encoding(query), kind)
+        self._pool.submit(
+            QueryJob(
+                answer=lambda arrived_s: self._answer(query, op, handler, arrived_s),
+                refuse=lambda error: self._refuse(query, op, error),
+                n_bytes=n_bytes,
+            )
+        )
+        return op
+
+    def _admit_cloud(self, query: zenoh.Query) -> None:
+        if _is_wild(query):
+            raise UnsupportedError("integrate changes a map: name the map, wildcards are not taken")
+        self._health.count("clouds.received")
+        job = CloudJob(robot_id=None, payload=query.payload or zenoh.ZBytes(b""), query=query)
+        try:
+            codec.check_size(job.n_bytes, self._limits.max_cloud_bytes, "cloud")
+            codec.check_encoding(_encoding(query), messages.Cloud)
+        except PotserverError as error:
+            self._receipts.refuse(job, error, patient=True)
+            return
+        for refused, why in self._intake.admit(job):
+            self._receipts.refuse(refused, why, patient=True)
+
+    # --- answers, on a worker thread ------------------------------------------------------------------------
+
+    def _answer(
+        self,
+        query: zenoh.Query,
+        op: str,
+        handler: Callable[[bytes, float], Iterator[codec.Wire]],
+        arrived_s: float,
+    ) -> None:
+        try:
+            # hostile numbers may overflow; the checks see the infinity, the log needs no warning
+            with query, np.errstate(over="ignore"):  # `with query` ends the replies on every path
+                try:
+                    payload = query.payload.to_bytes() if query.payload is not None else b""
+                    for reply in handler(payload, arrived_s):
+                        query.reply(self._keys.query(op), reply.payload, encoding=reply.encoding)
+                    self._health.count(f"queries.{op}.ok")
+                    self._health.observe(op, (time.monotonic() - arrived_s) * 1e3)
+                except PotserverError as error:  # expected: the asker gets a typed reply
+                    self._reply_error(query, op, error)
+                except Exception:  # a bug: the traceback stays here
+                    log.exception("query_failed", key=self._keys.query(op))
+                    self._reply_error(query, op, PotserverError(_BUG))
+        except Exception:
+            log.exception("query_reply_failed", key=self._keys.query(op))
+
+    def _points(self, payload: bytes, arrived_s: float) -> Iterator[codec.Wire]:
+        request = codec.decode_points_query(payload, self._limits)
+        _check_deadline(arrived_s, request.deadline_ms)
+        yield codec.encode_occupancy(self._asker.occupancy(request.points))
+
+    def _grid(self, payload: bytes, arrived_s: float) -> Iterator[codec.Wire]:
+        request = codec.decode_grid_query(payload)
+        _check_deadline(arrived_s, request.deadline_ms)
+        plan = self._asker.grid(
+            request.lower, request.upper, request.resolution, part_cells=self._grid_part_cells
+        )
+        for part in range(plan.n_parts):
+            first_cell, occupancy = plan.part(part)
+            yield codec.encode_grid_part(
+                part=part,
+                n_parts=plan.n_parts,
+                shape=plan.shape,
+                first_cell=first_cell,
+                lower=request.lower,
+                resolution=request.resolution,
+                occupancy=occupancy,
+            )
+
+    def _params(self, payload: bytes, arrived_s: float) -> Iterator[codec.Wire]:
+        request = codec.decode_params_query(payload)
+        _check_deadline(arrived_s, request.deadline_ms)
+        parts, revision = self._asker.params(
+            request.lower, request.upper, part_kernels=self._params_part_kernels
+        )
+        snapshot = self._mapper.snapshot
+        for part, kernels in enumerate(parts):
+            yield codec.encode_params_part(
+                part=part,
+                n_parts=len(parts),
+                map_revision=revision,
+                kernels=kernels,
+                observed_activation=snapshot.observed_activation,
+                prior_var=snapshot.prior_var,
+            )
+
+    def _atoms(self, payload: bytes, _arrived_s: float) -> Iterator[codec.Wire]:
+        atom_id = codec.decode_atoms_query(payload)
+        dictionary, usage = self._mapper.dictionary, self._mapper.atom_usage
+        if atom_id is None:
+            yield codec.encode_atom_list(list(dictionary), usage)
+        else:
+            snapshot = self._mapper.snapshot
+            yield codec.encode_atom(
+                dictionary.get(atom_id),
+                usage,
+                observed_activation=snapshot.observed_activation,
+                prior_var=snapshot.prior_var,
+            )
+
+    def _info(self, payload: bytes, _arrived_s: float) -> Iterator[codec.Wire]:
+        codec.decode_info_query(payload)
+        yield self._encode_info()
+
+    # --- errors ---------------------------------------------------------------------------------------------
+
+    def _refuse(self, query: zenoh.Query, op: str, error: PotserverError) -> None:
+        with query:
+            self._reply_error(query, op, error)
+
+    def _reply_error(self, query: zenoh.Query, op: str, error: PotserverError) -> None:
+        self._health.count(f"queries.{op}.{error.code}")
+        log.debug(
+            "query_refused", map_id=self._keys.map_id, op=op, reason=error.code, detail=str(error)[:300]
+        )
+        _reply_err(query, error)
+
+
+class ControlQueryable:
+    """`ctl/<verb>` of one map: clear and drain. Both follow every cloud that was admitted before them."""
+
+    VERBS = ("clear", "drain")
+
+    def __init__(
+        self,
+        session: zenoh.Session,
+        map_keys: keys.MapKeys,
+        *,
+        mapper: Mapper,
+        intake: IntakeQueue,
+        clear: Callable[[], None],
+        prompt: Outbox,
+        health: Health,
+        limits: Limits,
+    ) -> None:
+        self._keys, self._mapper, self._intake, self._clear = map_keys, mapper, intake, clear
+        self._prompt, self._health, self._limits = prompt, health, limits
+        self._queryable = session.declare_queryable(
+            map_keys.control("*"), zenoh.handlers.FifoChannel(4), complete=True
+        )
+
+    def run(self) -> None:
+        """Admit requests until undeclared, on a thread of our own."""
+        for query in self._queryable:
+            verb = _op_of(query, self.VERBS) or "unknown"
+            try:
+                self._admit(query, verb)
+            except PotserverError as error:
+                self._refuse(query, verb, error)
+            except Exception:
+                log.exception("control_failed", key=str(query.key_expr))
+                self._refuse(query, verb, PotserverError(_BUG))
+
+    def undeclare(self) -> None:
+        """Take no more; ends `run`."""
+        self._queryable.undeclare()
+
+    def _admit(self, query: zenoh.Query, verb: str) -> None:
+        if _is_wild(query):
+            raise UnsupportedError(
+                "control changes a map: name the map and the verb, wildcards are not taken"
+            )
+        if verb == "unknown":
+            raise UnsupportedError(f"no verb {_last_chunk(query)!r}; there are {', '.join(self.VERBS)}")
+        payload = query.payload
+        codec.check_size(
+            len(payload) if payload is not None else 0, self._limits.max_query_bytes, "control request"
+        )
+        codec.check_encoding(_encoding(query), messages.ControlRequest)
+        timeout_s = codec.decode_control(payload.to_bytes() if payload is not None else b"")
+        deadline_s = None if timeout_s is None else time.monotonic() + timeout_s
+
+        def run() -> None:
+            try:
+                if deadline_s is not None and time.monotonic() > deadline_s:
+                    raise DeadlineError(
+                        f"{verb}: {timeout_s} s passed before the clouds ahead of it were mapped"
+                    )
+                if verb == "clear":
+                    self._clear()
+            except PotserverError as error:
+                self._refuse(query, verb, error)
+            except Exception:
+                log.exception("control_failed", key=self._keys.control(verb))
+                self._refuse(query, verb, PotserverError(_BUG))
+            else:
+                self._done(query, verb)
+
+        if verb == "drain":
+            self._intake.stop_admitting()
+            log.info("map_draining", map_id=self._keys.map_id)
+        self._intake.admit_barrier(Barrier(run, lambda error: self._refuse(query, verb, error)))
+
+    def _done(self, query: zenoh.Query, verb: str) -> None:
+        snapshot = self._mapper.snapshot
+        done = {"clear": "the map is empty", "drain": "all clouds are in the map, and no more are taken"}[
+            verb
+        ]
+        self._health.count(f"control.{verb}.ok")
+
+        def send() -> None:
+            with query:
+                reply = codec.encode_control_reply(
+                    verb=verb, map_revision=snapshot.map_revision, message=done
+                )
+                query.reply(self._keys.control(verb), reply.payload, encoding=reply.encoding)
+
+        self._prompt.post_now(send)
+
+    def _refuse(self, query: zenoh.Query, verb: str, error: PotserverError) -> None:
+        self._health.count(f"control.{verb}.{error.code}")
+
+        def send() -> None:
+            with query:
+                _reply_err(query, error)
+
+        self._prompt.post_now(send)
+
+
+class StatsQueryable:
+    """`srv/<server>/stats` as a query."""
+
+    def __init__(
+        self, session: zenoh.Session, key: str, *, encode_stats: Callable[[], codec.Wire], limits: Limits
+    ) -> None:
+        self._key, self._encode_stats, self._limits = key, encode_stats, limits
+        self._queryable = session.declare_queryable(key, zenoh.handlers.FifoChannel(4), complete=True)
+
+    def run(self) -> None:
+        """Answer until undeclared, on a thread of our own."""
+        for query in self._queryable:
+            with query:
+                try:
+                    payload = query.payload
+                    codec.check_size(
+                        len(payload) if payload is not None else 0,
+                        self._limits.max_query_bytes,
+                        "stats query",
+                    )
+                    codec.check_encoding(_encoding(query), messages.StatsQuery)
+                    codec.decode_stats_query(payload.to_bytes() if payload is not None else b"")
+                    reply = self._encode_stats()
+                    query.reply(self._key, reply.payload, encoding=reply.encoding)
+                except PotserverError as error:
+                    _reply_err(query, error)
+                except Exception:
+                    log.exception("stats_query_failed", key=self._key)
+                    _reply_err(query, PotserverError(_BUG))
+
+    def undeclare(self) -> None:
+        """Take no more; ends `run`."""
+        self._queryable.undeclare()
+
+
+def _reply_err(query: zenoh.Query, error: PotserverError) -> None:
+    reply = codec.encode_error(error)
+    with contextlib.suppress(zenoh.ZError):  # the asker may be gone
+        query.reply_err(reply.payload, encoding=reply.encoding)
+
+
+def _check_deadline(arrived_s: float, deadline_ms: float | None) -> None:
+    if deadline_ms is not None and (waited_ms := (time.monotonic() - arrived_s) * 1e3) > deadline_ms:
+        raise DeadlineError(f"the query waited {waited_ms:.1f} ms, its deadline was {deadline_ms:.1f} ms")
+
+
+def _last_chunk(query: zenoh.Query) -> str:
+    return str(query.key_expr).rsplit("/", 1)[-1][:80]
+
+
+def _op_of(query: zenoh.Query, known: tuple[str, ...]) -> str | None:
+    """The operation that a query names. The map may be a wildcard, the operation may not."""
+    last = _last_chunk(query)
+    return last if last in known else None
+
+
+def _is_wild(query: zenoh.Query) -> bool:
+    key = str(query.key_expr)
+    return "*" in key or "$" in key
+
+
+def _encoding(query: zenoh.Query) -> str | None:
+    return None if query.encoding is None else str(query.encoding)

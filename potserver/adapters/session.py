@@ -1,0 +1,215 @@
+"""Our Zenoh node: a peer with one loopback listener and no multicast, unless told otherwise.
+
+Precedence, weakest first: what is built in here, the Zenoh configuration file, `--cfg KEY:VALUE`, the flags
+`-m -e -l`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import json
+import os
+import socket
+import threading
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import zenoh
+
+from potserver.adapters.log import get_logger
+from potserver.errors import SettingsError
+
+log = get_logger("potserver.session")
+
+DEFAULT_LISTEN = "tcp/127.0.0.1:7447"
+MAX_MESSAGE_BYTES = 64 * 2**20  # of one reassembled message; the library's default is 1 GiB
+_FREE_PORT_TRIES = 5
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class ZenohSettings:
+    """How our node joins a Zenoh network: the usual flags, by their usual names."""
+
+    mode: str | None = None  # peer (default), client or router
+    connect: tuple[str, ...] = ()  # endpoints of routers or peers to join
+    listen: tuple[str, ...] = ()  # default tcp/127.0.0.1:7447; port 0 picks a free one
+    config: str | None = None  # a Zenoh configuration file; default $ZENOH_CONFIG
+    cfg: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # single keys, as --cfg KEY:VALUE
+    shared_memory: bool = (
+        True  # puts between processes of one host may go through /dev/shm; off in small containers
+    )
+    shared_memory_queries: bool = (
+        False  # queries and replies too: faster, but can lose them when a receiver stalls
+    )
+
+
+def build_config(settings: ZenohSettings, *, root: str, wire_guard_bytes: int) -> zenoh.Config:
+    """The Zenoh configuration of a server.
+
+    A built-in value holds where the file left the library's default in place; whatever the file says
+    otherwise wins.
+
+    Args:
+        settings: From the settings tree.
+        root: Key prefix that the size guard covers.
+        wire_guard_bytes: Zenoh drops larger puts and queries without a word, so this lies far above our own
+            limits.
+    Raises:
+        SettingsError: the file cannot be read, or Zenoh refuses a key or value.
+    """
+    untouched = zenoh.Config()
+    path = settings.config or os.environ.get("ZENOH_CONFIG")
+    config: zenoh.Config = zenoh.Config()
+    if path is not None:
+        if not Path(path).is_file():
+            raise SettingsError(f"no Zenoh configuration file {path}")
+        try:
+            config = zenoh.Config.from_file(path)
+        except zenoh.ZError as error:
+            raise SettingsError(f"{path} is not a Zenoh configuration: {_first_line(error)}") from error
+
+    for key, value in _built_in(root, wire_guard_bytes).items():
+        if config.get_json(key) == untouched.get_json(key):
+            _insert(config, key, value)
+    for key, value in settings.cfg.items():
+        _insert(config, key, value)
+    if settings.mode is not None:
+        _insert(config, "mode", settings.mode)
+    if settings.connect:
+        _insert(config, "connect/endpoints", list(settings.connect))
+    if settings.listen:
+        _insert(config, "listen/endpoints", list(settings.listen))
+    elif _mode(config) == "client" and config.get_json("listen/endpoints") == json.dumps([DEFAULT_LISTEN]):
+        _insert(config, "listen/endpoints", [])
+    if not settings.shared_memory:
+        _insert(config, "transport/shared_memory/enabled", False)
+    elif settings.shared_memory_queries:
+        _insert(config, "transport/shared_memory/transport_optimization/messages", ["put", "query", "reply"])
+    if json.loads(config.get_json("transport/unicast/lowlatency")):
+        # such a transport does not fragment: every message above 64 KiB would be lost
+        raise SettingsError("transport/unicast/lowlatency loses every message above 64 KiB: leave it off")
+    return config
+
+
+def _built_in(root: str, wire_guard_bytes: int) -> dict[str, Any]:
+    return {
+        "mode": "peer",
+        "listen/endpoints": [DEFAULT_LISTEN],
+        "scouting/multicast/enabled": False,
+        "timestamping/enabled": True,
+        "transport/link/rx/max_message_size": MAX_MESSAGE_BYTES,
+        # queries over shared memory can be lost when the receiver stalls; puts have receipts
+        "transport/shared_memory/transport_optimization/messages": ["put"],
+        # shared memory does not heed max_message_size; this filter does its work there too
+        "low_pass_filter": [
+            {
+                "id": "potserver_guard",
+                "flows": ["ingress"],
+                "messages": ["put", "query"],
+                "key_exprs": [f"{root}/**"],
+                "size_limit": wire_guard_bytes,
+            }
+        ],
+    }
+
+
+def open_session(config: zenoh.Config) -> tuple[zenoh.Session, list[str]]:
+    """Open the node; a listener on port 0 gets a free port.
+
+    Returns:
+        The session, and the endpoints it listens on.
+    Raises:
+        SettingsError: an endpoint cannot be opened; the message is one line with a hint.
+    """
+    wanted = _endpoints(config)
+    tries = _FREE_PORT_TRIES if any(_wants_free_port(endpoint) for endpoint in wanted) else 1
+    for attempt in range(1, tries + 1):
+        endpoints = [_with_free_port(endpoint) for endpoint in wanted]
+        if endpoints != wanted:
+            _insert(config, "listen/endpoints", endpoints)
+        try:
+            return zenoh.open(config), endpoints
+        except zenoh.ZError as error:
+            if attempt == tries:  # else somebody took the free port between the look and the use
+                raise SettingsError(_explain(error, endpoints)) from error
+    raise AssertionError("unreachable")
+
+
+def close_session(session: zenoh.Session, timeout_s: float) -> bool:
+    """Close the node without ever hanging.
+
+    Returns:
+        False if Zenoh did not finish in time; the process must then leave by `os._exit`.
+    """
+
+    def close() -> None:
+        with contextlib.suppress(zenoh.ZError):
+            session.close()
+
+    thread = threading.Thread(target=close, name="zenoh-close", daemon=True)
+    thread.start()
+    thread.join(timeout_s)
+    if thread.is_alive():
+        log.error("session_close_timed_out", timeout_s=timeout_s)
+    return not thread.is_alive()
+
+
+def _insert(config: zenoh.Config, key: str, value: Any) -> None:
+    """Set one key; a string is tried as JSON5 first, so that `--cfg transport/link/tx/lease:5000` works."""
+    candidates = [value, json.dumps(value)] if isinstance(value, str) else [json.dumps(value)]
+    failure: Exception | None = None
+    for candidate in candidates:
+        try:
+            config.insert_json5(key, candidate)
+            return
+        except zenoh.ZError as error:
+            failure = error
+    raise SettingsError(f"Zenoh refuses {key} = {value!r}: {_first_line(failure)}") from failure
+
+
+def _mode(config: zenoh.Config) -> str:
+    return str(json.loads(config.get_json("mode")) or "peer")
+
+
+def _endpoints(config: zenoh.Config) -> list[str]:
+    listed = json.loads(config.get_json("listen/endpoints"))
+    if isinstance(listed, dict):  # by mode
+        listed = listed.get(_mode(config)) or []
+    return [str(endpoint) for endpoint in listed]
+
+
+def _wants_free_port(endpoint: str) -> bool:
+    return endpoint.split("#", 1)[0].endswith(":0")
+
+
+def _with_free_port(endpoint: str) -> str:
+    if not _wants_free_port(endpoint):
+        return endpoint
+    address, hash_mark, options = endpoint.partition("#")
+    protocol, _, location = address.partition("/")
+    host = location[: -len(":0")].strip("[]")
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    kind = socket.SOCK_DGRAM if protocol in ("udp", "quic") else socket.SOCK_STREAM
+    with socket.socket(family, kind) as probe:
+        probe.bind((host, 0))
+        port = probe.getsockname()[1]
+    return f"{address[:-1]}{port}{hash_mark}{options}"
+
+
+def _explain(error: zenoh.ZError, endpoints: list[str]) -> str:
+    text = str(error)
+    if "Address already in use" in text:
+        where = next((e for e in endpoints if e in text), ", ".join(endpoints))
+        return (
+            f"cannot listen on {where}: the port is taken, perhaps by another potserver or a Zenoh router."
+            " Hint: choose a port with --listen tcp/127.0.0.1:PORT, port 0 for any free one,"
+            " or join the router with --connect and listen elsewhere"
+        )
+    return f"cannot open Zenoh: {_first_line(error)}"
+
+
+def _first_line(error: Exception | None) -> str:
+    """Zenoh's reason without its source paths."""
+    return str(error).splitlines()[0].split(" at /", 1)[0][:300]

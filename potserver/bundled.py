@@ -1,0 +1,38 @@
+"""The recordings that the package ships (see NOTICE), opened the way the demo and the atom builder use them."""
+
+from __future__ import annotations
+
+from importlib import resources
+from pathlib import Path
+
+from potclient.datasets import Recording, open_dataset
+from potclient.datasets.planar import PlanarSlice
+
+STREET = "street"  # two outdoor LiDAR scans, 0.5 m apart
+ROOMS = "rooms"  # twelve scans of a simulated indoor scene: four places, three headings
+FLOOR = "floor"  # the rooms as a planar scanner sees them
+STREET_FLOOR = "street-floor"  # the street as a planar scanner sees it
+
+_ROOMS_MAX_RANGE_M = 8.0  # longer readings of that simulated sensor are beams without an echo
+
+
+def open_bundled(name: str) -> Recording:
+    """One of the bundled recordings by name; KeyError for another name."""
+    return {
+        STREET: _street,
+        ROOMS: _rooms,
+        FLOOR: lambda: PlanarSlice(_rooms()),
+        STREET_FLOOR: lambda: PlanarSlice(_street()),
+    }[name]()
+
+
+def _street() -> Recording:
+    return open_dataset(_folder("outdoor_street"))
+
+
+def _rooms() -> Recording:
+    return open_dataset(_folder("indoor_rooms"), max_range_m=_ROOMS_MAX_RANGE_M)
+
+
+def _folder(name: str) -> Path:
+    return Path(str(resources.files("potserver") / "data" / "scans" / name))

@@ -1,0 +1,152 @@
+"""KernelMap: an immutable set of kernels that answers queries."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from potserver.domain.types import Float64, KernelSet, Occupancy
+from potserver.errors import BadPointsError, ShapeError
+from potserver.numerics import kernel_index
+from potserver.numerics.occupancy import predict_occupancy
+from potserver.numerics.threads import default_threads
+
+# A point whose kernels sum to less activation than this is unobserved: nothing near it was ever seen.
+OBSERVED_ACTIVATION = 0.05
+# Variance of the latent where nothing is known, log-odds^2; the prior of the weights (see numerics.logistic).
+PRIOR_VAR = 100.0
+
+
+class KernelMap:
+    """K kernels and the index that makes asking them fast. Never changes; any number of threads may query it at once."""
+
+    def __init__(
+        self,
+        kernels: KernelSet,
+        *,
+        observed_activation: float = OBSERVED_ACTIVATION,
+        prior_var: float = PRIOR_VAR,
+        map_revision: int = 0,
+        threads: int | None = None,
+        tau: float | None = None,
+    ) -> None:
+        """Index the kernels.
+
+        Args:
+            kernels: In the map frame; gamma enters by its mean.
+            observed_activation: Points with a smaller activation sum answer 0.5, `prior_var`, and `observed` false.
+            prior_var: Latent variance of unobserved points, log-odds^2.
+            map_revision: Carried into the answers.
+            threads: Threads a query may use; all processors by default.
+            tau: Support cut, if it was measured on a similar map before; see `numerics.kernel_index`.
+        """
+        self.kernels = kernels
+        self.observed_activation = observed_activation
+        self.prior_var = prior_var
+        self.map_revision = map_revision
+        self._threads = threads or default_threads()
+        self._index = kernel_index.build_index(
+            kernels.hinge_mean,
+            kernels.gamma.astype(np.float64),
+            kernels.weight_mean.astype(np.float64),
+            kernels.weight_var.astype(np.float64),
+            activation_cut=observed_activation / 20.0,
+            tau=tau,
+        )
+
+    @classmethod
+    def from_arrays(
+        cls,
+        hinge_points: ArrayLike,
+        gamma: ArrayLike,
+        weight_mean: ArrayLike,
+        weight_var: ArrayLike,
+        *,
+        observed_activation: float = OBSERVED_ACTIVATION,
+        prior_var: float = PRIOR_VAR,
+        threads: int | None = None,
+    ) -> KernelMap:
+        """A map from bare arrays, hinges and gammas without dispersion.
+
+        Args:
+            hinge_points: (K, 3) or (K, 2) m.
+            gamma: (K,) 1/m^2, > 0.
+            weight_mean: (K,) log-odds.
+            weight_var: (K,) log-odds^2, >= 0; a variance, not a standard deviation.
+        Raises:
+            ShapeError: the arrays disagree on K, or gamma or a variance has an illegal sign, or something is not finite.
+        """
+        hinge = as_points(hinge_points)
+        g, w, v = (np.asarray(a, np.float64).reshape(-1) for a in (gamma, weight_mean, weight_var))
+        if not len(hinge) == len(g) == len(w) == len(v):
+            raise ShapeError(f"{len(hinge)} hinge points, {len(g)} gammas, {len(w)} means, {len(v)} variances: K differs")
+        if not (np.isfinite(w).all() and np.isfinite(v).all() and np.isfinite(g).all()):
+            raise ShapeError("gamma, weight_mean and weight_var must be finite")
+        if (g <= 0).any() or (v < 0).any():
+            raise ShapeError("gamma must be > 0 and weight_var >= 0")
+        # a Gamma distribution of shape 1 / rel_var; as sharp as float32 tells apart
+        shape = np.full(len(g), 1e6)
+        kernels = KernelSet(
+            hinge_mean=hinge,
+            hinge_var=np.zeros((len(hinge), 3), np.float32),
+            gamma_shape=shape.astype(np.float32),
+            gamma_rate=(shape / g).astype(np.float32),
+            weight_mean=w.astype(np.float32),
+            weight_var=v.astype(np.float32),
+        )
+        return cls(kernels, observed_activation=observed_activation, prior_var=prior_var, threads=threads)
+
+    def __len__(self) -> int:
+        return len(self.kernels)
+
+    @property
+    def tau(self) -> float:
+        """The support cut of the index, to hand to the next revision."""
+        return self._index.tau
+
+    def occupancy(self, points: ArrayLike) -> Occupancy:
+        """Mean and variance of the occupancy probability, and of the latent, anywhere.
+
+        Args:
+            points: (N, 3) or (N, 2) m, map frame; float64 keeps the precision of far coordinates.
+        Raises:
+            ShapeError: not (N, 3) or (N, 2).
+            BadPointsError: NaN or infinite coordinates.
+        Source: paper eq. 1; the moderated sigmoid of MacKay 1992.
+        """
+        sums = self.latent(as_points(points))
+        observed = sums.activation >= self.observed_activation
+        latent_mean = np.where(observed, sums.mean, np.float32(0))
+        latent_var = np.where(observed, sums.var, np.float32(self.prior_var))
+        # float64: in float32 a sure answer would round to exactly 1 and cost an infinite log-loss when wrong
+        mean, var = predict_occupancy(latent_mean.astype(np.float64), latent_var.astype(np.float64))
+        return Occupancy(
+            mean=mean,
+            var=var,
+            latent_mean=latent_mean,
+            latent_var=latent_var,
+            observed=observed,
+            map_revision=self.map_revision,
+        )
+
+    def latent(self, points: Float64) -> kernel_index.LatentSums:
+        """The bare sums of eq. 1 at (N, 3) points, with no rule for unobserved ones."""
+        return kernel_index.latent_sums(self._index, points, threads=self._threads)
+
+
+def as_points(points: ArrayLike) -> Float64:
+    """(N, 3) float64 from (N, 3) or (N, 2); 2D points get z = 0.
+
+    Raises:
+        ShapeError: neither of the two shapes.
+        BadPointsError: NaN or infinite coordinates.
+    """
+    array = np.asarray(points, np.float64)
+    if array.ndim != 2 or array.shape[1] not in (2, 3):
+        raise ShapeError(f"points: {array.shape}, need (N, 3) or (N, 2)")
+    if not np.isfinite(array).all():
+        raise BadPointsError("points have NaN or infinite coordinates")
+    if array.shape[1] == 2:
+        array = np.concatenate([array, np.zeros((len(array), 1))], axis=1)
+    return np.ascontiguousarray(array)
+

@@ -1,0 +1,219 @@
+"""The nouns. Frozen, numpy inside, every array with shape, dtype, unit and frame. 2D is 3D with z = 0."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from potserver.errors import BadPointsError, BadPoseError, EmptyError, ShapeError
+
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+Bool = NDArray[np.bool_]
+
+
+@dataclasses.dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Scan:
+    """One LiDAR sweep with its pose.
+
+    Raises (on construction):
+        ShapeError, BadPointsError, EmptyError, BadPoseError: see `__post_init__`.
+    """
+
+    robot_id: str
+    seq: int
+    stamp_ns: int
+    points: Float32  # (N, 3) m, sensor frame: echoes, and ends of beams without one
+    is_return: Bool  # (N,) false = no echo, the beam was free up to the point
+    T_map_sensor: Float64  # (4, 4) rigid
+    is_planar: bool = False  # a 2D scanner: everything has z = 0 in the map frame
+
+    def __post_init__(self) -> None:
+        n = len(self.points)
+        if self.points.shape != (n, 3) or self.is_return.shape != (n,) or self.T_map_sensor.shape != (4, 4):
+            raise ShapeError(
+                f"scan: points {self.points.shape}, is_return {self.is_return.shape}, pose {self.T_map_sensor.shape};"
+                " need (N, 3), (N,), (4, 4)"
+            )
+        if n == 0:
+            raise EmptyError("the cloud has no points")
+        if not np.isfinite(self.points).all():
+            bad = int((~np.isfinite(self.points)).any(axis=1).sum())
+            raise BadPointsError(f"{bad} of {n} points have NaN or infinite coordinates")
+        check_rigid(self.T_map_sensor)
+
+    @property
+    def origin(self) -> Float64:
+        """(3,) m, map frame: where the beams start."""
+        return self.T_map_sensor[:3, 3]
+
+
+def check_rigid(transform: Float64, tolerance: float = 1e-3) -> None:
+    """Refuse a matrix that is not a rotation and a translation.
+
+    Raises:
+        BadPoseError: not finite, a bottom row other than (0, 0, 0, 1), or a rotation part that is off by more than
+            `tolerance` (scale, shear or mirror).
+    """
+    if not np.isfinite(transform).all():
+        raise BadPoseError("the pose has NaN or infinite entries")
+    if not np.allclose(transform[3], (0.0, 0.0, 0.0, 1.0), atol=1e-9):
+        raise BadPoseError(f"the pose's last row is {transform[3].tolist()}, need 0 0 0 1")
+    rotation = transform[:3, :3]
+    defect = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
+    if defect > tolerance or np.linalg.det(rotation) < 0:
+        raise BadPoseError(f"the pose is not rigid: R R^T is off by {defect:.2g}, det {np.linalg.det(rotation):.3f}")
+
+
+@dataclasses.dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class KernelSet:
+    """K kernels of a Bayesian Hilbert map in one frame: ten numbers each (paper, section II-A)."""
+
+    hinge_mean: Float64  # (K, 3) m; float64, because maps live at UTM coordinates
+    hinge_var: Float32  # (K, 3) m^2, along the frame's axes
+    gamma_shape: Float32  # (K,) > 0
+    gamma_rate: Float32  # (K,) m^2, > 0; E[gamma] = shape / rate
+    weight_mean: Float32  # (K,) log-odds
+    weight_var: Float32  # (K,) log-odds^2, > 0
+
+    def __post_init__(self) -> None:
+        k = len(self.hinge_mean)
+        for name, shape in (
+            ("hinge_mean", (k, 3)),
+            ("hinge_var", (k, 3)),
+            ("gamma_shape", (k,)),
+            ("gamma_rate", (k,)),
+            ("weight_mean", (k,)),
+            ("weight_var", (k,)),
+        ):
+            if getattr(self, name).shape != shape:
+                raise ShapeError(f"{name}: {getattr(self, name).shape}, need {shape}")
+
+    def __len__(self) -> int:
+        return len(self.hinge_mean)
+
+    @property
+    def gamma(self) -> Float32:
+        """(K,) 1/m^2: the mean of each kernel's Gamma distribution."""
+        return self.gamma_shape / self.gamma_rate
+
+    def take(self, index: NDArray[np.intp] | Bool | slice) -> KernelSet:
+        """The kernels that a numpy index picks."""
+        return KernelSet(**{f.name: getattr(self, f.name)[index] for f in dataclasses.fields(self)})
+
+    def replace(self, **arrays: NDArray[np.floating]) -> KernelSet:
+        """A copy with some arrays exchanged."""
+        return dataclasses.replace(self, **arrays)  # type: ignore[arg-type]
+
+    @staticmethod
+    def concatenate(sets: list[KernelSet]) -> KernelSet:
+        """One set of all kernels, in order; no sets give the empty set."""
+        if not sets:
+            return KernelSet.empty()
+        return KernelSet(
+            **{f.name: np.concatenate([getattr(s, f.name) for s in sets]) for f in dataclasses.fields(KernelSet)}
+        )
+
+    @staticmethod
+    def empty() -> KernelSet:
+        """No kernels."""
+        z = np.zeros(0, np.float32)
+        return KernelSet(
+            hinge_mean=np.zeros((0, 3)),
+            hinge_var=np.zeros((0, 3), np.float32),
+            gamma_shape=z,
+            gamma_rate=z,
+            weight_mean=z,
+            weight_var=z,
+        )
+
+
+@dataclasses.dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Atom:
+    """A source sector: its points and the kernels learned on them. Frame: sensor at the origin, x along the bisector."""
+
+    atom_id: str
+    dims: int  # 2 or 3
+    hit_points: Float32  # (H, 3) m, atom frame
+    free_points: Float32  # (F, 3) m, atom frame
+    kernels: KernelSet  # atom frame
+    radius_m: float
+    azimuth_width_rad: float
+    provenance: dict[str, str]
+
+
+@dataclasses.dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Sector:
+    """A pie slice of one scan (a cylindrical sector in 3D). Points in the sector frame: sensor origin, levelled, x along the bisector."""
+
+    azimuth_min_rad: float  # about the sensor, in the levelled sensor frame
+    azimuth_max_rad: float
+    radius_m: float
+    hit_points: Float32  # (M, 3) m, sector frame
+    free_points: Float32  # (F, 3) m, sector frame
+    T_map_sector: Float64  # (4, 4)
+
+    @property
+    def azimuth_width_rad(self) -> float:
+        """Opening angle of the slice."""
+        return self.azimuth_max_rad - self.azimuth_min_rad
+
+
+class SectorMatch(NamedTuple):
+    """Which atom served a sector, and how the transport ended."""
+
+    azimuth_min_rad: float
+    azimuth_max_rad: float
+    n_hits: int
+    n_free: int
+    atom_id: str | None
+    rotation_rad: float
+    w2_m2: float
+    n_kernels: int
+    converged: bool
+    marginal_error: float
+    n_iterations: int
+    reason: str | None = None
+
+
+@dataclasses.dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Occupancy:
+    """What a map says at N points, in the order asked."""
+
+    mean: Float64  # (N,) P(occupied)
+    var: Float64  # (N,) variance of that probability, in [0, 0.25]
+    latent_mean: Float32  # (N,) log-odds
+    latent_var: Float32  # (N,) log-odds^2
+    observed: Bool  # (N,) false = no kernel near: unknown, not free
+    map_revision: int = 0
+
+
+class TileChange(NamedTuple):
+    """Which cubes of the map a scan touched."""
+
+    tile_size_m: float
+    tiles: list[tuple[int, int, int]]  # floor(p_map / tile_size_m)
+
+
+@dataclasses.dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class MapUpdate:
+    """What one integrated scan did."""
+
+    map_revision: int
+    kernels: KernelSet  # the instantaneous map, map frame
+    sectors: list[SectorMatch]
+    n_points: int  # beams used
+    n_kernels_added: int
+    map_kernels: int
+    changed: TileChange
+    timings_ms: dict[str, float]  # per stage of the pipeline
+
+
+def yaw_pose(x_m: float, y_m: float, yaw_rad: float, z_m: float = 0.0) -> Float64:
+    """(4, 4) pose of a planar robot."""
+    c, s = math.cos(yaw_rad), math.sin(yaw_rad)
+    return np.array([[c, -s, 0, x_m], [s, c, 0, y_m], [0, 0, 1, z_m], [0, 0, 0, 1]], np.float64)

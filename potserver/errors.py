@@ -1,0 +1,126 @@
+"""Everything the server raises on purpose: one class per thing a caller can act on. Imports nothing."""
+
+from __future__ import annotations
+
+
+class PotserverError(Exception):
+    """Base of all expected errors. `code` is contract (potschemas.ErrorCode); the text is for people."""
+
+    code: str = "internal"
+    retryable: bool = False
+
+    def __init__(self, message: str, *, retry_after_s: float | None = None) -> None:
+        super().__init__(message)
+        self.retry_after_s = retry_after_s
+
+
+class BadMessageError(PotserverError):
+    """The bytes are not the message that the key promises."""
+
+    code = "bad_message"
+
+
+class ShapeError(PotserverError):
+    """An array has the wrong shape, dtype or byte count."""
+
+    code = "bad_array"
+
+
+class BadPoseError(PotserverError):
+    """A pose is not a rigid transform, or not finite."""
+
+    code = "bad_pose"
+
+
+class BadPointsError(PotserverError):
+    """Coordinates are NaN or infinite."""
+
+    code = "bad_points"
+
+
+class EmptyError(PotserverError):
+    """Nothing to do: no points at all, or none inside the range limits."""
+
+    code = "empty"
+
+
+class TooLargeError(PotserverError):
+    """Bytes, points or cells beyond the limit."""
+
+    code = "too_large"
+
+
+class OutOfRangeError(PotserverError):
+    """Coordinates beyond what the map may hold."""
+
+    code = "out_of_range"
+
+
+class OldStampError(PotserverError):
+    """The stamp is not newer than the last accepted cloud of this robot."""
+
+    code = "old_stamp"
+
+
+class NoPoseError(PotserverError):
+    """The cloud has no pose, and the pose stream has none at its stamp."""
+
+    code = "no_pose"
+
+
+class UnknownRobotError(PotserverError):
+    """The robot's id is not legal, or not on the allow list."""
+
+    code = "unknown_robot"
+
+
+class UnknownAtomError(PotserverError):
+    """No atom of this id in the dictionary."""
+
+    code = "unknown_atom"
+
+
+class UnsupportedError(PotserverError):
+    """No such operation or verb."""
+
+    code = "unsupported"
+
+
+class OverloadedError(PotserverError):
+    """The queue is full; try again after `retry_after_s`."""
+
+    code = "overloaded"
+    retryable = True
+
+
+class DeadlineError(PotserverError):
+    """The asker's deadline passed before the work could start."""
+
+    code = "deadline"
+    retryable = True
+
+
+class ShuttingDownError(PotserverError):
+    """The server takes no more work."""
+
+    code = "shutting_down"
+    retryable = True
+
+
+class DictionaryError(PotserverError):
+    """An atom dictionary file is missing, damaged, or of another version."""
+
+    code = "internal"
+
+
+class SettingsError(PotserverError):
+    """A setting is unknown or has an illegal value."""
+
+    code = "internal"
+
+
+def error_classes() -> dict[str, type[PotserverError]]:
+    """Every class by its code; the classes that never leave the process share `internal` with the base."""
+    return {cls.code: cls for cls in PotserverError.__subclasses__() if cls.code != "internal"} | {
+        "internal": PotserverError
+    }

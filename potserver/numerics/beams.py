@@ -1,0 +1,63 @@
+"""From beams to labelled points: where an echo came from is occupied, what the beam crossed is free (paper, section II-A)."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+Float64 = NDArray[np.float64]
+Bool = NDArray[np.bool_]
+
+
+class LabelledPoints(NamedTuple):
+    """Points with their labels, and the beam that each one belongs to."""
+
+    points: Float64  # (N, 3) m, in the frame of the beams
+    occupied: Bool  # (N,) true = hit (y = 1), false = free (y = 0)
+    beam: NDArray[np.int64]  # (N,) number of the beam
+
+
+class Beams(NamedTuple):
+    """Beams that start at one place and end at `ends`."""
+
+    ends: Float64  # (N, 3) m, relative to the start
+    is_return: Bool  # (N,) false = no echo: free up to the end
+
+
+def limit_range(beams: Beams, min_range_m: float, max_range_m: float) -> Beams:
+    """Leave out beams shorter than `min_range_m`; cut longer ones than `max_range_m`, which then end without an echo."""
+    length = np.linalg.norm(beams.ends, axis=1)
+    keep = (length >= min_range_m) & (length > 0)
+    ends, length, is_return = beams.ends[keep], length[keep], beams.is_return[keep]
+    too_long = length > max_range_m
+    scale = np.where(too_long, max_range_m / length, 1.0)
+    return Beams(ends * scale[:, None], is_return & ~too_long)
+
+
+def label_beams(beams: Beams, *, free_per_beam: int, gap_m: float, rng: np.random.Generator) -> LabelledPoints:
+    """Hits at the ends of returned beams; free points along every beam.
+
+    Args:
+        beams: N beams.
+        free_per_beam: Free points a beam, one in each of that many equal pieces of it (stratified).
+        gap_m: No free point lies closer than this to the end of a returned beam.
+        rng: Where in its piece each free point falls.
+    Returns:
+        Hits first, in beam order; then the free points, in beam order.
+    """
+    n = len(beams.ends)
+    hit = np.flatnonzero(beams.is_return)
+    length = np.linalg.norm(beams.ends, axis=1)
+    usable = np.where(beams.is_return, length - gap_m, length)
+    long_enough = np.flatnonzero(usable > 0)
+    fraction = (np.arange(free_per_beam) + rng.random((len(long_enough), free_per_beam))) / max(free_per_beam, 1)
+    fraction *= (usable[long_enough] / length[long_enough])[:, None]
+    free = (beams.ends[long_enough, None, :] * fraction[..., None]).reshape(-1, 3)
+    assert len(hit) <= n
+    return LabelledPoints(
+        np.concatenate([beams.ends[hit], free]),
+        np.concatenate([np.ones(len(hit), bool), np.zeros(len(free), bool)]),
+        np.concatenate([hit, np.repeat(long_enough, free_per_beam)]),
+    )

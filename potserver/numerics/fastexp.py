@@ -1,0 +1,64 @@
+"""A float32 exponential that the compiler turns into SIMD code.
+
+numba's `np.exp` calls a scalar function for each value (3 to 7 ns); this branch-free one takes about 0.4 ns. Range reduction by
+adding and subtracting 1.5 * 2^23, then a degree-6 polynomial; the largest relative error is 2e-7.
+
+It must stay a function of its own with `contract` as its only fast-math flag: under `reassoc` the compiler cancels the add and
+the subtract, and the result is silently wrong by up to 40 %.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numba as nb
+import numpy as np
+from llvmlite import ir
+from numba import types
+from numba.extending import intrinsic
+
+# for the loops around exp32; not for exp32 itself
+FAST = {"nnan", "ninf", "nsz", "arcp", "contract", "afn", "reassoc"}
+
+_f = np.float32
+_LOG2E, _MAGIC = _f(1.44269504088896), _f(12582912.0)
+_LN2_HIGH, _LN2_LOW = _f(0.693359375), _f(-2.12194440e-4)
+_P0, _P1, _P2 = _f(1.9875691500e-4), _f(1.3981999507e-3), _f(8.3334519073e-3)
+_P3, _P4, _P5 = _f(4.1665795894e-2), _f(1.6666665459e-1), _f(5.0000001201e-1)
+_ONE, _ZERO, _LOWEST, _HIGHEST = _f(1), _f(0), _f(-87.0), _f(88.0)
+_BIAS, _MANTISSA_BITS, _MAGIC_BITS = np.int32(127), np.int32(23), np.int32(0x4B400000)
+
+
+@intrinsic
+def _float_bits(typing_context: Any, x: Any) -> Any:
+    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        return builder.bitcast(args[0], ir.IntType(32))
+
+    return types.int32(types.float32), codegen
+
+
+@intrinsic
+def _bits_float(typing_context: Any, x: Any) -> Any:
+    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        return builder.bitcast(args[0], ir.FloatType())
+
+    return types.float32(types.int32), codegen
+
+
+@nb.njit(fastmath={"contract"}, error_model="numpy", cache=True)
+def exp32(x: np.float32) -> np.float32:
+    """exp(x) for float32; 0 at and below -87, exp(88) above 88."""
+    clipped = min(max(x, _LOWEST), _HIGHEST)
+    shifted = clipped * _LOG2E + _MAGIC
+    exponent = _float_bits(shifted) - _MAGIC_BITS
+    whole = shifted - _MAGIC
+    r = clipped - whole * _LN2_HIGH - whole * _LN2_LOW
+    p = _P0
+    p = p * r + _P1
+    p = p * r + _P2
+    p = p * r + _P3
+    p = p * r + _P4
+    p = p * r + _P5
+    y = p * r * r + r + _ONE
+    y = y * _bits_float((exponent + _BIAS) << _MANTISSA_BITS)
+    return y if x > _LOWEST else _ZERO

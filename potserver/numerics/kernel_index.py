@@ -1,0 +1,402 @@
+"""Sums over many squared-exponential kernels, with each point looking only at the kernels that reach it.
+
+    latent mean  sum_m w_m phi_m(x),   latent variance  sum_m v_m phi_m(x)^2,   activation  sum_m phi_m(x)
+    phi_m(x) = exp(-gamma_m |x - h_m|^2)                                                        (paper eq. 1)
+
+A kernel's reach is where what it adds falls below a cut tau, which depends on its gamma, weight *and* variance. tau is chosen by
+measuring: at sample points, the absolute sum of everything cut must change the probability by less than a budget. Kernels are
+sorted into levels by reach (a factor of two each), every level into its own grid of cells, so wide and narrow ones cost alike.
+Queries are sorted into cubes; the kernels that reach a cube are gathered once, relative to its centre (so large coordinates
+lose nothing in float32), and a dense SIMD loop runs over queries times gathered kernels.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numba as nb
+import numpy as np
+from numpy.typing import NDArray
+
+from potserver.numerics.fastexp import FAST, exp32
+from potserver.numerics.threads import parallel_map, spans
+
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+Int64 = NDArray[np.int64]
+
+_PROBABILITY_BUDGET = 4e-5  # of a probability, for all cut kernels together
+_TAUS = np.logspace(-3, -12, 10)
+_SAMPLES = 96
+_TARGET_QUERIES_PER_CUBE = 24
+
+
+class KernelIndex(NamedTuple):
+    """K kernels sorted by level and cell. Immutable; any number of threads may query it."""
+
+    hinge: Float64  # (K, 3) m
+    columns: Float32  # (4, K): -gamma 1/m^2, w, v, reach m
+    order: Int64  # (K,) number of each kernel in the arrays that the index was built from
+    level_start: Int64  # (L + 1,) first kernel of each level
+    level_edge: Float64  # (L,) m, cell edge; no kernel of the level reaches farther
+    level_cell: Int64  # (L, 3) cell of the level's lower corner
+    level_size: Int64  # (L, 3) cells along each axis
+    keys: Int64  # (K,) cell number inside its level, ascending within a level
+    tau: float  # the cut
+    median_reach_m: float
+
+
+def reach(gamma: Float64, weight: Float64, variance: Float64, tau: float, activation_cut: float) -> Float64:
+    """(K,) m: where |w| phi < tau, v phi^2 < tau and phi < activation_cut all hold."""
+    with np.errstate(divide="ignore"):
+        log_ratio = np.maximum(np.log(np.abs(weight) / tau), 0.5 * np.log(variance / tau))
+    return np.sqrt(np.maximum(log_ratio, -np.log(activation_cut)) / gamma)
+
+
+def choose_tau(hinge: Float64, gamma: Float64, weight: Float64, variance: Float64) -> float:
+    """The largest cut that keeps the probability within budget at sample points.
+
+    |dp| <= sum_cut |w| phi / (4 sqrt(1 + pi s2 / 8)) + 0.05 sum_cut v phi^2: the sigmoid's slope is at most 1/4, and the
+    probit scaling's derivative in s2 is below 0.05 everywhere.
+    """
+    rng = np.random.default_rng(0)
+    pick = rng.choice(len(hinge), min(_SAMPLES, len(hinge)), replace=False)
+    points = hinge[pick] + rng.normal(0.0, 1.0, (len(pick), 3)) / np.sqrt(2.0 * gamma[pick, None])
+    cut_mean, cut_var, total_var = _cut_sums(points, hinge, gamma, np.abs(weight), variance, _TAUS)
+    change = cut_mean / (4.0 * np.sqrt(1.0 + np.pi / 8.0 * total_var[:, None])) + 0.05 * cut_var
+    within = change.max(axis=0) <= _PROBABILITY_BUDGET
+    return float(_TAUS[np.argmax(within)] if within.any() else _TAUS[-1])
+
+
+def build_index(
+    hinge: Float64,
+    gamma: Float64,
+    weight: Float64,
+    variance: Float64,
+    *,
+    activation_cut: float,
+    tau: float | None = None,
+) -> KernelIndex:
+    """Sort kernels for fast sums.
+
+    Args:
+        hinge: (K, 3) float64, m.
+        gamma: (K,) 1/m^2, > 0.
+        weight: (K,) log-odds.
+        variance: (K,) log-odds^2, >= 0.
+        activation_cut: phi below this is left out of the activation sum too.
+        tau: The cut, if it is known already; measured otherwise.
+    """
+    hinge = np.ascontiguousarray(hinge, np.float64)
+    gamma, weight, variance = (np.asarray(a, np.float64) for a in (gamma, weight, variance))
+    if tau is None:
+        tau = choose_tau(hinge, gamma, weight, variance) if len(hinge) else float(_TAUS[0])
+    r = reach(gamma, weight, variance, tau, activation_cut)
+    # levels halve the reach; a floor keeps one tiny kernel from making a level of its own
+    top = float(r.max(initial=1e-3))
+    level = np.clip(np.ceil(np.log2(np.maximum(r, 1e-6) / top)).astype(np.int64), -12, 0)
+    used = np.unique(level)[::-1]
+    starts, edges, corners, sizes, keys, order = [0], [], [], [], [], []
+    for number in used:
+        members = np.flatnonzero(level == number)
+        edge = max(top * 2.0 ** float(number), 1e-3)
+        cell = np.floor(hinge[members] / edge).astype(np.int64)
+        corner = cell.min(axis=0)
+        size = cell.max(axis=0) - corner + 1
+        cell -= corner
+        key = (cell[:, 2] * size[1] + cell[:, 1]) * size[0] + cell[:, 0]
+        by_key = np.argsort(key, kind="stable")
+        order.append(members[by_key])
+        keys.append(key[by_key])
+        edges.append(edge)
+        corners.append(corner)
+        sizes.append(size)
+        starts.append(starts[-1] + len(members))
+    permutation = np.concatenate(order) if order else np.zeros(0, np.int64)
+    columns = np.stack([-gamma, weight, variance, r])[:, permutation].astype(np.float32)
+    return KernelIndex(
+        hinge=hinge[permutation],
+        columns=np.ascontiguousarray(columns),
+        order=permutation.astype(np.int64),
+        level_start=np.asarray(starts, np.int64),
+        level_edge=np.asarray(edges, np.float64),
+        level_cell=np.asarray(corners, np.int64).reshape(-1, 3),
+        level_size=np.asarray(sizes, np.int64).reshape(-1, 3),
+        keys=np.concatenate(keys) if keys else np.zeros(0, np.int64),
+        tau=tau,
+        median_reach_m=float(np.median(r)) if len(r) else 1.0,
+    )
+
+
+class LatentSums(NamedTuple):
+    """Sums of eq. 1 and of its variance at N points."""
+
+    mean: Float32  # (N,) log-odds
+    var: Float32  # (N,) log-odds^2
+    activation: Float32  # (N,) sum of phi
+
+
+def latent_sums(index: KernelIndex, points: Float64, *, threads: int = 1) -> LatentSums:
+    """Evaluate the kernels of an index.
+
+    Args:
+        points: (N, 3) float64, m, same frame as the hinges.
+    Source: paper eq. 1; variance of a factorised posterior.
+    """
+    n = len(points)
+    out = np.zeros((3, n), np.float32)
+    if n == 0 or len(index.hinge) == 0:
+        return LatentSums(*out)
+    order, cuts = group_points(points, index.median_reach_m)
+    grouped = points[order]
+    sums = np.zeros((3, n), np.float32)
+
+    def run(span: tuple[int, int]) -> None:
+        _sum_cubes(
+            grouped, cuts[span[0] : span[1] + 1], index.hinge, index.columns, index.level_start, index.level_edge,
+            index.level_cell, index.level_size, index.keys, sums,
+        )  # fmt: skip
+
+    parallel_map(run, spans(len(cuts) - 1, 16 * threads if threads > 1 else 1), threads)
+    out[:, order] = sums
+    return LatentSums(*out)
+
+
+def group_points(points: Float64, scale_m: float) -> tuple[Int64, Int64]:
+    """Sort points into cubes of about `scale_m`, larger where points are sparse.
+
+    Returns:
+        order: (N,) so that `points[order]` has each cube's points together.
+        cuts: (C + 1,) where each cube starts.
+    """
+    edge = 0.5 * scale_m
+    lower = points.min(axis=0)
+    extent = points.max(axis=0) - lower
+    while True:
+        edge = max(edge, float(extent.max()) / 2**20)  # 21 bits an axis
+        cell = ((points - lower) / edge).astype(np.int64)
+        key = (cell[:, 2] << 42) | (cell[:, 1] << 21) | cell[:, 0]
+        order = np.argsort(key, kind="stable")
+        ordered = key[order]
+        cuts = np.flatnonzero(np.concatenate([[True], ordered[1:] != ordered[:-1], [True]]))
+        if len(points) >= _TARGET_QUERIES_PER_CUBE * (len(cuts) - 1) or edge >= 1.5 * scale_m:
+            return order, cuts.astype(np.int64)
+        edge *= 1.8
+
+
+class SparseFeatures(NamedTuple):
+    """Rows of phi in compressed sparse rows, for the points in `order`."""
+
+    order: Int64  # (N,) row r belongs to points[order[r]]
+    indptr: Int64  # (N + 1,)
+    indices: NDArray[np.int32]  # (nnz,) kernel numbers as given
+    values: Float32  # (nnz,) phi
+
+
+def sparse_features(
+    points: Float64, hinge: Float64, gamma: Float64, *, cut: float, threads: int = 1
+) -> SparseFeatures:
+    """phi of every kernel at every point, where it is at least `cut`.
+
+    Args:
+        points: (N, 3) float64, m.
+        hinge: (K, 3) float64, m, same frame.
+        gamma: (K,) 1/m^2.
+        cut: Smallest phi that is kept, in (0, 1).
+    """
+    ones = np.ones(len(hinge))
+    index = build_index(hinge, gamma, ones, np.zeros(len(hinge)), activation_cut=cut, tau=cut)
+    if len(points) == 0 or len(hinge) == 0:
+        return SparseFeatures(
+            np.arange(len(points)), np.zeros(len(points) + 1, np.int64), np.zeros(0, np.int32), np.zeros(0, np.float32)
+        )
+    order, cuts = group_points(points, index.median_reach_m)
+    grouped = points[order]
+
+    def run(span: tuple[int, int]) -> tuple[Int64, NDArray[np.int32], Float32]:
+        return _feature_rows(  # type: ignore[no-any-return]
+            grouped, cuts[span[0] : span[1] + 1], index.hinge, index.columns, index.order, index.level_start,
+            index.level_edge, index.level_cell, index.level_size, index.keys, np.float32(cut),
+        )  # fmt: skip
+
+    parts = parallel_map(run, spans(len(cuts) - 1, 4 * threads if threads > 1 else 1), threads)
+    counts = np.concatenate([p[0] for p in parts])
+    return SparseFeatures(
+        order,
+        np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
+        np.concatenate([p[1] for p in parts]),
+        np.concatenate([p[2] for p in parts]),
+    )
+
+
+@nb.njit(nogil=True, error_model="numpy", cache=True)
+def _cut_sums(points, hinge, gamma, weight, variance, taus):  # type: ignore[no-untyped-def]
+    """Float64: for each sample and each tau, the sums that a cut at tau leaves out; and the whole variance."""
+    n, k, n_taus = len(points), len(hinge), len(taus)
+    cut_mean = np.zeros((n, n_taus))
+    cut_var = np.zeros((n, n_taus))
+    total = np.zeros(n)
+    for i in range(n):
+        for m in range(k):
+            d2 = 0.0
+            for c in range(3):
+                d = points[i, c] - hinge[m, c]
+                d2 += d * d
+            exponent = gamma[m] * d2
+            if exponent > 40.0:
+                continue
+            phi = np.exp(-exponent)
+            a = weight[m] * phi
+            b = variance[m] * phi * phi
+            total[i] += b
+            for j in range(n_taus):
+                if a < taus[j] and b < taus[j]:
+                    cut_mean[i, j] += a
+                    cut_var[i, j] += b
+    return cut_mean, cut_var, total
+
+
+@nb.njit(nogil=True, error_model="numpy", cache=True)
+def _lower_bound(keys, low, high, key):  # type: ignore[no-untyped-def]
+    while low < high:
+        middle = (low + high) >> 1
+        if keys[middle] < key:
+            low = middle + 1
+        else:
+            high = middle
+    return low
+
+
+@nb.njit(nogil=True, error_model="numpy", cache=True)
+def _gather(box_lower, box_upper, hinge, columns, level_start, level_edge, level_cell, level_size, keys, found):  # type: ignore[no-untyped-def]
+    """Numbers (in index order) of the kernels that reach the box; returns how many, and the buffer, grown if need be."""
+    n = 0
+    for level in range(len(level_edge)):
+        edge = level_edge[level]
+        first, last = level_start[level], level_start[level + 1]
+        nx, ny, nz = level_size[level]
+        x0 = max(int(np.floor(box_lower[0] / edge)) - 1 - level_cell[level, 0], 0)
+        y0 = max(int(np.floor(box_lower[1] / edge)) - 1 - level_cell[level, 1], 0)
+        z0 = max(int(np.floor(box_lower[2] / edge)) - 1 - level_cell[level, 2], 0)
+        x1 = min(int(np.floor(box_upper[0] / edge)) + 1 - level_cell[level, 0], nx - 1)
+        y1 = min(int(np.floor(box_upper[1] / edge)) + 1 - level_cell[level, 1], ny - 1)
+        z1 = min(int(np.floor(box_upper[2] / edge)) + 1 - level_cell[level, 2], nz - 1)
+        if x1 < x0:
+            continue
+        for z in range(z0, z1 + 1):
+            for y in range(y0, y1 + 1):
+                row = (z * ny + y) * nx
+                low = _lower_bound(keys, first, last, row + x0)
+                for m in range(low, last):
+                    if keys[m] > row + x1:
+                        break
+                    d2 = 0.0
+                    for c in range(3):
+                        d = max(max(box_lower[c] - hinge[m, c], hinge[m, c] - box_upper[c]), 0.0)
+                        d2 += d * d
+                    if d2 <= columns[3, m] * columns[3, m]:
+                        if n == len(found):
+                            larger = np.empty(2 * n, np.int64)
+                            larger[:n] = found
+                            found = larger
+                        found[n] = m
+                        n += 1
+    return n, found
+
+
+@nb.njit(nogil=True, fastmath=FAST, error_model="numpy", cache=True)
+def _sum_point(x, y, z, hx, hy, hz, minus_gamma, w, v, n):  # type: ignore[no-untyped-def]
+    mean = np.float32(0)
+    var = np.float32(0)
+    activation = np.float32(0)
+    for m in range(n):
+        dx = x - hx[m]
+        dy = y - hy[m]
+        dz = z - hz[m]
+        phi = exp32(minus_gamma[m] * (dx * dx + dy * dy + dz * dz))
+        mean += w[m] * phi
+        var += v[m] * phi * phi
+        activation += phi
+    return mean, var, activation
+
+
+@nb.njit(nogil=True, error_model="numpy", cache=True)
+def _box(points, a, b, lower, upper):  # type: ignore[no-untyped-def]
+    for c in range(3):
+        lower[c] = points[a, c]
+        upper[c] = points[a, c]
+        for q in range(a + 1, b):
+            lower[c] = min(lower[c], points[q, c])
+            upper[c] = max(upper[c], points[q, c])
+
+
+@nb.njit(nogil=True, error_model="numpy", cache=True)
+def _sum_cubes(points, cuts, hinge, columns, level_start, level_edge, level_cell, level_size, keys, sums):  # type: ignore[no-untyped-def]
+    found = np.empty(4096, np.int64)
+    local = np.empty((6, 4096), np.float32)
+    lower = np.empty(3)
+    upper = np.empty(3)
+    for cube in range(len(cuts) - 1):
+        a, b = cuts[cube], cuts[cube + 1]
+        _box(points, a, b, lower, upper)
+        n, found = _gather(
+            lower, upper, hinge, columns, level_start, level_edge, level_cell, level_size, keys, found
+        )
+        if n > local.shape[1]:
+            local = np.empty((6, 2 * n), np.float32)
+        cx = 0.5 * (lower[0] + upper[0])
+        cy = 0.5 * (lower[1] + upper[1])
+        cz = 0.5 * (lower[2] + upper[2])
+        for i in range(n):
+            m = found[i]
+            local[0, i] = hinge[m, 0] - cx
+            local[1, i] = hinge[m, 1] - cy
+            local[2, i] = hinge[m, 2] - cz
+            local[3, i] = columns[0, m]
+            local[4, i] = columns[1, m]
+            local[5, i] = columns[2, m]
+        for q in range(a, b):
+            sums[0, q], sums[1, q], sums[2, q] = _sum_point(
+                np.float32(points[q, 0] - cx), np.float32(points[q, 1] - cy), np.float32(points[q, 2] - cz),
+                local[0], local[1], local[2], local[3], local[4], local[5], n,
+            )  # fmt: skip
+
+
+@nb.njit(nogil=True, error_model="numpy", cache=True)
+def _feature_rows(points, cuts, hinge, columns, order, level_start, level_edge, level_cell, level_size, keys, cut):  # type: ignore[no-untyped-def]
+    first, last = cuts[0], cuts[-1]
+    counts = np.zeros(last - first, np.int64)
+    capacity = 32 * (last - first) + 1024
+    indices = np.empty(capacity, np.int32)
+    values = np.empty(capacity, np.float32)
+    found = np.empty(4096, np.int64)
+    lower = np.empty(3)
+    upper = np.empty(3)
+    total = 0
+    for cube in range(len(cuts) - 1):
+        a, b = cuts[cube], cuts[cube + 1]
+        _box(points, a, b, lower, upper)
+        n, found = _gather(
+            lower, upper, hinge, columns, level_start, level_edge, level_cell, level_size, keys, found
+        )
+        for q in range(a, b):
+            if total + n > capacity:
+                capacity = 2 * (total + n)
+                grown_indices = np.empty(capacity, np.int32)
+                grown_values = np.empty(capacity, np.float32)
+                grown_indices[:total] = indices[:total]
+                grown_values[:total] = values[:total]
+                indices, values = grown_indices, grown_values
+            row = total
+            for i in range(n):
+                m = found[i]
+                dx = np.float32(points[q, 0] - hinge[m, 0])
+                dy = np.float32(points[q, 1] - hinge[m, 1])
+                dz = np.float32(points[q, 2] - hinge[m, 2])
+                phi = exp32(columns[0, m] * (dx * dx + dy * dy + dz * dz))
+                if phi >= cut:
+                    indices[total] = order[m]
+                    values[total] = phi
+                    total += 1
+            counts[q - first] = total - row
+    return counts, indices[:total].copy(), values[:total].copy()

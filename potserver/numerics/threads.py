@@ -1,0 +1,40 @@
+"""Run a numba function that releases the GIL on a few threads.
+
+numba's own `parallel=True` is not used: its default threading layer may not be entered from two Python threads at once, and a
+map server always has a writer and readers inside the numerics at the same time.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
+from functools import lru_cache
+from typing import TypeVar
+
+T = TypeVar("T")
+R = TypeVar("R")
+
+
+def default_threads() -> int:
+    """The processors that this process may use."""
+    return max(1, len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1)
+
+
+@lru_cache(maxsize=None)
+def _pool(threads: int) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(threads, thread_name_prefix="numerics")
+
+
+def parallel_map(function: Callable[[T], R], items: Iterable[T], threads: int) -> list[R]:
+    """`[function(i) for i in items]`, in order, on `threads` threads; an error of any item is raised."""
+    work = list(items)
+    if threads <= 1 or len(work) <= 1:
+        return [function(item) for item in work]
+    return list(_pool(threads).map(function, work))
+
+
+def spans(n: int, parts: int) -> list[tuple[int, int]]:
+    """`range(n)` cut into at most `parts` runs of nearly equal length, none empty."""
+    parts = max(1, min(parts, n))
+    return [(i * n // parts, (i + 1) * n // parts) for i in range(parts)] if n else []

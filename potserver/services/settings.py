@@ -1,0 +1,129 @@
+"""What the mapping pipeline may be told. Two profiles: `default` is ours, `paper` repeats the authors' choices."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from enum import Enum
+
+from potserver.errors import SettingsError
+from potserver.numerics.displacement import OutOfSample
+
+
+class RankScore(str, Enum):
+    """How atoms are ranked against a sector."""
+
+    W2 = "w2"  # eq. 7: squared 2-Wasserstein distance of hits plus that of free points
+    NORMALISED = "normalised"  # the authors' code: each divided by its largest over all candidates, then added
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class MappingSettings:
+    """Settings of the pipeline; lengths in metres, angles in degrees here because people write them."""
+
+    profile: str = "default"
+
+    # beams
+    min_range_m: float = 0.3  # shorter beams hit the robot itself
+    max_range_m: float = 25.0  # longer beams are free up to here, and end without an echo
+    free_per_beam: int = 2
+    gap_m: float = 0.3  # between a hit and its last free point
+    beams_per_scan: int = 8_000  # of a denser scan, that many are drawn
+
+    # sectors
+    n_sectors: int = 6
+    align_sectors: bool = True  # turn each sector to its bisector, as atoms are; false: to the map's axes (authors)
+    keep_in_sector: bool = True  # transported kernels outside their sector are left out; false: outside the circle (authors)
+
+    # ranking (eq. 6-7)
+    rank_hits: int = 100
+    rank_free: int = 60
+    rank_reg_m2: float = 2.0
+    rank_tolerance: float = 1e-3
+    rank_iterations: int = 1000
+    rank_score: RankScore = RankScore.W2
+    rotations_deg: tuple[float, ...] = (-30.0, -15.0, 0.0, 15.0, 30.0)
+
+    # final coupling (eq. 3-4)
+    couple_points: int = 400
+    couple_reg: float = 0.0005  # of the largest cost
+    couple_tolerance: float = 1e-3
+    couple_iterations: int = 2000
+    label_aware: bool = True  # free-space kernels move with the free points' own coupling; false: with the hits'
+    out_of_sample: OutOfSample = OutOfSample.NEAREST
+
+    # refinement (RePOT)
+    refine: bool = True
+    prior_var: float = 50.0  # log-odds^2, of kernels without a transported prior
+    borrowed_var: float = 25.0  # log-odds^2, added to the variance of transported weights: borrowed is not seen
+    fill_coarse_m: float = 1.0  # spacing of kernels added where nothing explains a point; 0 adds none
+    fill_fine_m: float = 0.3  # the same near hits
+    feature_cut: float = 0.01  # activations below this are left out of the solve
+    refine_tolerance: float = 0.03  # of the gradient, at which the solve stops
+    explained_activation: float = 1.0  # a point with less from kernels of the right scale gets one of its own
+
+    # answers
+    observed_activation: float = 0.05
+    tile_size_m: float = 10.0  # granularity of change notices
+
+    def __post_init__(self) -> None:
+        for name in ("min_range_m", "gap_m", "fill_coarse_m", "fill_fine_m", "borrowed_var"):
+            self._need(name, getattr(self, name) >= 0, "at least 0")
+        for name in (
+            "max_range_m", "free_per_beam", "beams_per_scan", "n_sectors", "rank_hits", "rank_free", "rank_reg_m2",
+            "rank_tolerance", "rank_iterations", "couple_points", "couple_reg", "couple_tolerance", "couple_iterations",
+            "prior_var", "feature_cut", "refine_tolerance", "explained_activation", "observed_activation", "tile_size_m",
+        ):  # fmt: skip
+            self._need(name, getattr(self, name) > 0, "positive")
+        self._need("rotations_deg", len(self.rotations_deg) > 0, "at least one angle")
+        self._need("max_range_m", self.max_range_m > self.min_range_m, "above min_range_m")
+        self._need("feature_cut", self.feature_cut < 1, "below 1")
+        for field in dataclasses.fields(self):
+            value = getattr(self, field.name)
+            self._need(field.name, not (isinstance(value, float) and not math.isfinite(value)), "finite")
+
+    def _need(self, name: str, ok: bool, what: str) -> None:
+        if not ok:
+            raise SettingsError(f"mapping.{name} is {getattr(self, name)}, need {what}")
+
+    @staticmethod
+    def of_profile(profile: str) -> MappingSettings:
+        """The settings of a named profile.
+
+        Raises:
+            SettingsError: no profile of that name.
+        """
+        try:
+            return PROFILES[profile]
+        except KeyError:
+            raise SettingsError(f"no profile {profile!r}; there are {', '.join(PROFILES)}") from None
+
+
+# The authors' published code, as far as it is a choice and not a bug: five sectors of 72 degrees in the map's axes, 20 m, hits
+# and free points scored apart and normalised, eight 45-degree turns of the atom, all kernels moved by the hits' coupling with
+# the nearest point's displacement, full-circle crop, plain concatenation. They work in coordinates divided by 50, so their
+# ranking reg of 0.005 is 0.005 * 50^2 m^2.
+PAPER = MappingSettings(
+    profile="paper",
+    max_range_m=20.0,
+    n_sectors=5,
+    align_sectors=False,
+    keep_in_sector=False,
+    rank_hits=200,
+    rank_free=50,
+    rank_reg_m2=0.005 * 50.0**2,
+    rank_tolerance=1e-5,
+    rank_score=RankScore.NORMALISED,
+    rotations_deg=tuple(45.0 * k for k in range(-4, 4)),
+    couple_points=1500,
+    couple_reg=0.0005,
+    couple_tolerance=1e-4,
+    couple_iterations=4000,
+    label_aware=False,
+    out_of_sample=OutOfSample.NEAREST,
+    refine=False,
+    fill_coarse_m=0.0,
+    fill_fine_m=0.0,
+)
+
+PROFILES = {"default": MappingSettings(), "paper": PAPER}

@@ -1,0 +1,316 @@
+"""One fixed example of every message and of its edge cases: what the golden vectors are made of.
+
+The numbers are exact in binary, so that the readable form shows what the bytes hold.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from potschemas import messages as m
+from potschemas.wire import encode_array
+
+_STAMP_NS = 1_700_000_000_000_000_000
+
+
+def examples() -> dict[str, m.Message]:
+    """Messages by name: the schema, and after one more dot the variant, as in `pot.cloud.v1.planar`."""
+    named: dict[str, m.Message] = {}
+
+    def add(message: m.Message, variant: str = "") -> None:
+        named[f"{message.schema}.{variant}" if variant else message.schema] = message
+
+    points = _f4([[4.0, 0.5, -0.25], [3.5, -1.0, 0.0], [60.0, 0.0, 1.5]])
+    add(
+        m.Cloud(
+            seq=7,
+            stamp_ns=_STAMP_NS,
+            points=points,
+            T_map_sensor=_pose(12.0, -3.5, 1.75),
+            is_return=_bool([True, True, False]),
+            robot="r1",
+        )
+    )
+    add(m.Cloud(seq=0, stamp_ns=0, points=points), "minimal")
+    add(m.Cloud(seq=8, stamp_ns=_STAMP_NS, points=_f4([[4.0, 0.5], [3.5, -1.0]])), "planar")
+    add(m.Cloud(seq=9, stamp_ns=_STAMP_NS, points=points, is_return=_bool([False] * 3)), "no_return")
+    add(m.Cloud(seq=2**63 - 1, stamp_ns=2**63 - 1, points=_f4(np.zeros((0, 3)))), "no_points")
+    add(m.Pose(stamp_ns=_STAMP_NS, T_map_sensor=_pose(12.0, -3.5, 1.75)))
+
+    kernels, no_kernels = _kernels(2), _kernels(0)
+    add(kernels)
+    add(no_kernels, "empty")
+    add(_kernels(1, origin=[500_000.0, 5_400_000.0, 250.5]), "far_origin")
+
+    served = m.SectorReport(
+        azimuth_min_rad=-0.5,
+        azimuth_max_rad=0.75,
+        n_hits=420,
+        n_free=1260,
+        atom_id="street-corner-03",
+        rotation_rad=0.125,
+        w2_m2=0.375,
+        n_kernels=2,
+        converged=True,
+        marginal_error=2.0**-20,
+        n_iterations=64,
+    )
+    left_out = m.SectorReport(
+        azimuth_min_rad=0.75,
+        azimuth_max_rad=2.0,
+        n_hits=3,
+        n_free=0,
+        atom_id=None,
+        rotation_rad=math.nan,
+        w2_m2=math.inf,
+        n_kernels=0,
+        converged=False,
+        marginal_error=math.nan,
+        n_iterations=0,
+        reason="too few echoes",
+    )
+    add(
+        m.Receipt(
+            map="default",
+            robot="r1",
+            seq=7,
+            status=m.ReceiptStatus.ACCEPTED,
+            queue_depth=1,
+            wait_ms=0.5,
+            integrate_ms=48.25,
+            map_revision=31,
+            n_points=3,
+            n_kernels=2,
+            n_kernels_added=1,
+            map_kernels=5120,
+            sectors=[served, left_out],
+            kernels=kernels,
+        )
+    )
+    add(
+        m.Receipt(
+            map="default",
+            robot="r1",
+            seq=8,
+            status=m.ReceiptStatus.DROPPED,
+            reason=m.ErrorCode.OVERLOADED.value,
+            message="4 clouds are waiting",
+            queue_depth=4,
+            map_revision=31,
+        ),
+        "dropped",
+    )
+    add(
+        m.Receipt(
+            map="default",
+            robot="Robot 1",
+            seq=-1,
+            status=m.ReceiptStatus.REJECTED,
+            reason=m.ErrorCode.BAD_MESSAGE.value,
+            message="pot.cloud.v1: truncated after 17 bytes",
+            map_revision=31,
+        ),
+        "rejected",
+    )
+    params = m.Params(
+        map="default",
+        robot="r1",
+        seq=7,
+        stamp_ns=_STAMP_NS,
+        map_revision=31,
+        kernels=kernels,
+        sectors=[served],
+    )
+    add(params)
+    add(
+        m.Params(map="default", robot="r1", seq=8, stamp_ns=_STAMP_NS, map_revision=31, kernels=no_kernels),
+        "empty",
+    )
+    add(
+        m.Revision(
+            map="default",
+            map_revision=31,
+            stamp_ns=_STAMP_NS,
+            n_kernels=5120,
+            tile_size_m=8.0,
+            changed_tiles=[[0, -1, 0], [2, -1, 0]],
+        )
+    )
+    add(
+        m.Revision(
+            map="default", map_revision=32, stamp_ns=_STAMP_NS, n_kernels=0, tile_size_m=8.0, changed_tiles=[]
+        ),
+        "no_tiles",
+    )
+
+    add(m.PointsQuery(points=_f4([[1.0, 2.0, 0.5], [-3.0, 0.25, 0.5]]), deadline_ms=250.0))
+    add(m.PointsQuery(points=_f8([[500_000.25, 5_400_000.5]])), "planar_float64")
+    occupancy = m.Occupancy(
+        mean=_f4([0.875, 0.5]),
+        var=_f4([0.015625, 0.25]),
+        latent_mean=_f4([2.5, 0.0]),
+        latent_var=_f4([0.75, 64.0]),
+        observed=_bool([True, False]),
+        map_revision=31,
+    )
+    none = _f4(np.zeros(0))
+    add(occupancy)
+    add(
+        m.Occupancy(
+            mean=none, var=none, latent_mean=none, latent_var=none, observed=_bool([]), map_revision=0
+        ),
+        "no_points",
+    )
+    add(m.GridQuery(lower=[-1.0, -1.0, 0.0], upper=[1.0, 1.0, 0.5], resolution=0.25, deadline_ms=1000.0))
+    add(m.GridQuery(lower=[-1.0, -1.0, 0.0], upper=[1.0, 1.0, 0.5], resolution=0.25), "minimal")
+    add(
+        m.GridPart(
+            part=1,
+            n_parts=64,
+            shape=[8, 8, 2],
+            first_cell=2,
+            lower=[-1.0, -1.0, 0.0],
+            resolution=0.25,
+            occupancy=occupancy,
+        )
+    )
+    add(m.ParamsQuery(lower=[-8.0, -8.0, -2.0], upper=[8.0, 8.0, 4.0], deadline_ms=1000.0))
+    add(m.ParamsQuery(), "whole_map")
+    add(m.ParamsPart(part=0, n_parts=2, map_revision=31, kernels=kernels))
+    add(m.ParamsPart(part=0, n_parts=1, map_revision=0, kernels=no_kernels), "empty")
+
+    info = m.AtomInfo(
+        atom_id="street-corner-03",
+        dims=3,
+        n_hits=2,
+        n_free=1,
+        n_kernels=2,
+        radius_m=20.0,
+        azimuth_width_rad=1.25,
+        times_used=17,
+        provenance={"licence": "MIT", "source": "generated town 3"},
+    )
+    add(m.AtomsQuery(atom_id="street-corner-03"))
+    add(m.AtomsQuery(), "list")
+    add(m.AtomList(atoms=[info]))
+    add(m.AtomList(atoms=[]), "empty")
+    add(
+        m.Atom(
+            info=info,
+            hit_points=_f4([[5.0, 0.5, 0.0], [5.0, -0.5, 1.0]]),
+            free_points=_f4([[2.5, 0.0, 0.5]]),
+            kernels=kernels,
+        )
+    )
+
+    add(m.InfoQuery())
+    limits = m.Limits(
+        max_cloud_bytes=8 * 2**20,
+        max_cloud_points=300_000,
+        max_query_bytes=2**20,
+        max_query_points=1_000_000,
+        max_grid_cells=20_000_000,
+        max_range_m=120.0,
+        max_coordinate_m=1_000_000.0,
+    )
+    add(_info(limits, lower=[-40.0, -32.5, -2.0], upper=[88.0, 64.0, 6.5], n_scans=31))
+    add(_info(limits, lower=None, upper=None, n_scans=0), "empty_map")
+    add(m.StatsQuery())
+    add(
+        m.Stats(
+            server="s1",
+            stamp_ns=_STAMP_NS,
+            uptime_s=12.5,
+            state="serving",
+            counters={"clouds.accepted": 31, "clouds.received": 32, "clouds.rejected.bad_pose": 1},
+            queues={"clouds.bytes": 480_000, "clouds.depth": 1},
+            latencies={
+                "integrate": m.LatencySummary(count=31, p50_ms=48.0, p95_ms=61.5, p99_ms=70.25, max_ms=72.0)
+            },
+            rss_bytes=700_000_000,
+            map_kernels={"default": 5120},
+        )
+    )
+    unmeasured = m.LatencySummary(count=0, p50_ms=math.nan, p95_ms=math.nan, p99_ms=math.nan, max_ms=math.nan)
+    add(
+        m.Stats(
+            server="s1",
+            stamp_ns=_STAMP_NS,
+            uptime_s=0.0,
+            state="draining",
+            counters={},
+            queues={},
+            latencies={"points": unmeasured},
+            rss_bytes=0,
+            map_kernels={},
+        ),
+        "idle",
+    )
+
+    add(m.ControlRequest(timeout_s=5.0))
+    add(m.ControlRequest(), "minimal")
+    add(m.ControlReply(verb="clear", map_revision=32, message="5120 kernels removed"))
+    add(m.ErrorReply(code=m.ErrorCode.BAD_POSE, message="the pose has NaN or infinite entries"))
+    add(
+        m.ErrorReply(
+            code=m.ErrorCode.OVERLOADED, message="the queue is full", retryable=True, retry_after_s=0.25
+        ),
+        "retry",
+    )
+    return named
+
+
+def _f4(values: ArrayLike) -> m.Array:
+    return encode_array(np.asarray(values, np.float32))
+
+
+def _f8(values: ArrayLike) -> m.Array:
+    return encode_array(np.asarray(values, np.float64))
+
+
+def _bool(values: list[bool]) -> m.Array:
+    return encode_array(np.asarray(values, np.bool_))
+
+
+def _pose(x_m: float, y_m: float, z_m: float) -> m.Array:
+    """A quarter turn to the left, which is exact."""
+    return _f8([[0.0, -1.0, 0.0, x_m], [1.0, 0.0, 0.0, y_m], [0.0, 0.0, 1.0, z_m], [0.0, 0.0, 0.0, 1.0]])
+
+
+def _kernels(k: int, origin: list[float] | None = None) -> m.Kernels:
+    i = np.arange(k)
+    return m.Kernels(
+        origin=origin or [0.0, 0.0, 0.0],
+        hinge_mean=_f4(np.stack([i + 0.5, 2.0 - i, 0.25 * i], axis=1)),
+        hinge_var=_f4(np.full((k, 3), 0.0625)),
+        gamma_shape=_f4(8.0 + i),
+        gamma_rate=_f4(np.full(k, 4.0)),
+        weight_mean=_f4(3.0 - 5.0 * i),
+        weight_var=_f4(np.full(k, 0.5)),
+        observed_activation=0.125,
+        prior_var=64.0,
+    )
+
+
+def _info(limits: m.Limits, *, lower: list[float] | None, upper: list[float] | None, n_scans: int) -> m.Info:
+    return m.Info(
+        server="s1",
+        version="0.1.0",
+        map="default",
+        maps=["default", "site-b"],
+        profile="default",
+        map_revision=n_scans,
+        n_kernels=5120 if n_scans else 0,
+        n_atoms=12,
+        n_scans=n_scans,
+        lower=lower,
+        upper=upper,
+        tile_size_m=8.0,
+        observed_activation=0.125,
+        prior_var=64.0,
+        limits=limits,
+        started_ns=_STAMP_NS,
+    )

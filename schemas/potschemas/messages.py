@@ -1,0 +1,455 @@
+"""Every message that crosses the wire, typed once.
+
+The Struct is the source of truth: `python -m potschemas.generate` makes from it, and from the comment beside
+each field, the JSON Schemas in `json/`, the golden byte vectors in `vectors/` and the tables of the README. A
+message is a MessagePack map with these field names; arrays travel as `Array`. Coordinates are metres, angles
+radians, stamps nanoseconds since the Unix epoch, and every pose says both of its frames:
+`p_map = T_map_sensor @ p_sensor`.
+
+Receivers ignore fields that they do not know, so that a field with a default may be added within a version;
+anything else (a new required field, another meaning, a new enum value) needs a new schema version.
+"""
+
+from __future__ import annotations
+
+import sys
+from enum import Enum
+from typing import Annotated, ClassVar
+
+import msgspec
+
+_INT64_MAX = 2**63 - 1  # every integer fits into a signed 64-bit one, which all languages have
+_FLOAT_MAX = sys.float_info.max
+
+Count = Annotated[int, msgspec.Meta(ge=0, le=_INT64_MAX)]
+PositiveCount = Annotated[int, msgspec.Meta(ge=1, le=_INT64_MAX)]
+Sequence = Annotated[int, msgspec.Meta(ge=0, le=_INT64_MAX)]
+ReceiptSequence = Annotated[int, msgspec.Meta(ge=-1, le=_INT64_MAX)]
+Finite = Annotated[float, msgspec.Meta(ge=-_FLOAT_MAX, le=_FLOAT_MAX)]  # neither NaN nor infinite
+Positive = Annotated[float, msgspec.Meta(gt=0, le=_FLOAT_MAX)]
+WaitSeconds = Annotated[float, msgspec.Meta(ge=0, le=_FLOAT_MAX)]
+# NaN or infinite where nothing was measured, which JSON shows as null: the mark tells the generator
+Measured = Annotated[float, msgspec.Meta(extra_json_schema={"nan_is_null": True})]
+# `$` alone would let a trailing newline pass
+Identifier = Annotated[str, msgspec.Meta(pattern=r"^[a-z0-9][a-z0-9_.-]{0,62}$(?!\n)")]
+Dims = Annotated[int, msgspec.Meta(ge=2, le=3)]
+Vector3 = Annotated[list[Finite], msgspec.Meta(min_length=3, max_length=3)]
+GridShape = Annotated[list[Count], msgspec.Meta(min_length=3, max_length=3)]
+_Int64 = Annotated[int, msgspec.Meta(ge=-_INT64_MAX - 1, le=_INT64_MAX)]
+TileIndex = Annotated[list[_Int64], msgspec.Meta(min_length=3, max_length=3)]
+
+MAX_AXES = 4
+MAX_AXIS_LENGTH = 2**31 - 1
+_AxisLength = Annotated[int, msgspec.Meta(ge=0, le=MAX_AXIS_LENGTH)]
+ArrayShape = Annotated[list[_AxisLength], msgspec.Meta(max_length=MAX_AXES)]
+
+
+class DType(str, Enum):
+    """Element types that an array may have: little-endian, and nothing that needs pickle."""
+
+    FLOAT32 = "<f4"
+    FLOAT64 = "<f8"
+    INT64 = "<i8"
+    UINT8 = "|u1"
+    BOOL = "|b1"
+
+
+class Array(msgspec.Struct, frozen=True, kw_only=True):
+    """A dense, C-ordered, little-endian array."""
+
+    dtype: DType  # element type
+    shape: ArrayShape  # at most 4 axes; the empty list is one single number
+    data: bytes  # a MessagePack bin object of product(shape) elements; never a string
+
+
+class Message(msgspec.Struct, frozen=True, kw_only=True):
+    """Base of all messages; `schema` is what the Zenoh encoding names after the semicolon."""
+
+    schema: ClassVar[str] = ""
+
+
+# --- clouds in ------------------------------------------------------------------------------------
+
+
+class Cloud(Message, frozen=True, kw_only=True):
+    """One scan with its pose: the payload of `in/<robot>/cloud` and of `q/integrate`."""
+
+    schema: ClassVar[str] = "pot.cloud.v1"
+
+    seq: Sequence  # the robot's own counter, echoed in the receipt
+    stamp_ns: Sequence  # when the scan was taken
+    points: Array  # (N, 3) or (N, 2) float32, m, sensor frame; 2D is 3D with z = 0
+    T_map_sensor: Array | None = None  # (4, 4) float64, rigid; absent = by the pose stream at stamp_ns
+    is_return: Array | None = None  # (N,) bool; false = no echo, free up to the point; absent = all true
+    robot: Identifier | None = None  # who sends; needed by `q/integrate`, where the key does not say it
+
+
+class Pose(Message, frozen=True, kw_only=True):
+    """One pose of a robot's optional pose stream, `in/<robot>/pose`."""
+
+    schema: ClassVar[str] = "pot.pose.v1"
+
+    stamp_ns: Sequence  # when the robot was there
+    T_map_sensor: Array  # (4, 4) float64, rigid
+
+
+# --- kernels --------------------------------------------------------------------------------------
+
+
+class Kernels(Message, frozen=True, kw_only=True):
+    """K kernels in the map frame, ten numbers each, and the scalars that turn them into answers.
+
+    f(x) = sum_m w_m exp(-gamma_m |x - h_m|^2), gamma_m = gamma_shape_m / gamma_rate_m. A point whose summed
+    activation is below `observed_activation` is unobserved: 0.5, with latent variance `prior_var`.
+    """
+
+    schema: ClassVar[str] = "pot.kernels.v1"
+
+    origin: Vector3  # m, map frame; added to hinge_mean
+    hinge_mean: Array  # (K, 3) float32, m, relative to origin
+    hinge_var: Array  # (K, 3) float32, m^2, along the map axes
+    gamma_shape: Array  # (K,) float32, > 0
+    gamma_rate: Array  # (K,) float32, m^2, > 0; the mean of gamma is shape / rate, in 1/m^2
+    weight_mean: Array  # (K,) float32, log-odds
+    weight_var: Array  # (K,) float32, log-odds^2
+    observed_activation: Finite  # summed activation below which a point is unobserved
+    prior_var: Finite  # log-odds^2, of the latent where nothing was observed
+
+
+class SectorReport(msgspec.Struct, frozen=True, kw_only=True):
+    """How one sector of a scan found its atom and how the transport ended."""
+
+    azimuth_min_rad: Finite  # rad, sensor frame
+    azimuth_max_rad: Finite  # rad, sensor frame
+    n_hits: Count  # echoes in the sector
+    n_free: Count  # free-space samples in the sector
+    atom_id: str | None  # none: the sector was left without an atom, `reason` says why
+    rotation_rad: Measured  # rad, by which the atom was turned; no meaning without one
+    w2_m2: Measured  # m^2, squared 2-Wasserstein distance (entropic plan) to the atom; not finite without one
+    n_kernels: Count  # kernels this sector gave to the instantaneous map
+    converged: bool  # the solver reached its tolerance
+    marginal_error: Measured  # L1 distance of the plan's marginals from uniform; not finite without one
+    n_iterations: Count  # of the solver
+    reason: str | None = None  # for people: why there is no atom
+
+
+class ReceiptStatus(str, Enum):
+    """What became of a cloud."""
+
+    ACCEPTED = "accepted"  # it is in the map
+    DROPPED = "dropped"  # sound, but not taken: load or shutdown
+    REJECTED = "rejected"  # unsound: it will never be taken as it is
+
+
+class Receipt(Message, frozen=True, kw_only=True):
+    """The answer to every cloud: `out/<robot>/receipt`, and the reply to `q/integrate`."""
+
+    schema: ClassVar[str] = "pot.receipt.v1"
+
+    map: Identifier  # the map that was asked
+    robot: str  # who sent the cloud; not a legal id if that is why it was rejected
+    seq: ReceiptSequence  # of the cloud; -1 if it could not be read
+    status: ReceiptStatus  # accepted, dropped or rejected
+    reason: str | None = None  # an ErrorCode value, when not accepted
+    message: str | None = None  # for people
+    queue_depth: Count = 0  # clouds waiting when the receipt was written
+    wait_ms: Finite = 0.0  # ms, time in the queue
+    integrate_ms: Finite = 0.0  # ms, time in the mapper
+    map_revision: Count = 0  # after this cloud
+    n_points: Count = 0  # beams used
+    n_kernels: Count = 0  # kernels of the instantaneous map
+    n_kernels_added: Count = 0  # kernels that the overall map took
+    map_kernels: Count = 0  # kernels in the overall map now
+    sectors: list[SectorReport] = []  # how each sector was served
+    kernels: Kernels | None = None  # the instantaneous map; in `q/integrate` replies only
+
+
+class Params(Message, frozen=True, kw_only=True):
+    """The transported parameters of one cloud: `out/<robot>/params`."""
+
+    schema: ClassVar[str] = "pot.params.v1"
+
+    map: Identifier  # the map that took the cloud
+    robot: Identifier  # who sent the cloud
+    seq: Sequence  # of the cloud
+    stamp_ns: Sequence  # of the cloud
+    map_revision: Count  # of the overall map, after this cloud
+    kernels: Kernels  # the instantaneous map: this cloud alone
+    sectors: list[SectorReport] = []  # how each sector was served
+
+
+class Revision(Message, frozen=True, kw_only=True):
+    """The map changed: `ev/revision`."""
+
+    schema: ClassVar[str] = "pot.revision.v1"
+
+    map: Identifier  # which map
+    map_revision: Count  # the new one; grows by one a change
+    stamp_ns: Sequence  # when the change was made
+    n_kernels: Count  # in the overall map now
+    tile_size_m: Positive  # m, edge of a tile
+    changed_tiles: list[TileIndex]  # floor(p_map / tile_size_m)
+
+
+# --- queries --------------------------------------------------------------------------------------
+
+
+class PointsQuery(Message, frozen=True, kw_only=True):
+    """`q/points`: occupancy at any points."""
+
+    schema: ClassVar[str] = "pot.points_query.v1"
+
+    points: Array  # (N, 3) or (N, 2) float32 or float64, m, map frame
+    deadline_ms: Positive | None = None  # ms from arrival; past it the work is not started
+
+
+class Occupancy(Message, frozen=True, kw_only=True):
+    """What the map says at N points, in the order asked."""
+
+    schema: ClassVar[str] = "pot.occupancy.v1"
+
+    mean: Array  # (N,) float32, P(occupied)
+    var: Array  # (N,) float32, variance of that probability, in [0, 0.25]
+    latent_mean: Array  # (N,) float32, log-odds
+    latent_var: Array  # (N,) float32, log-odds^2
+    observed: Array  # (N,) bool; false = no kernel near: unknown, which is not free
+    map_revision: Count  # all answers are of this one
+
+
+class GridQuery(Message, frozen=True, kw_only=True):
+    """`q/grid`: occupancy at the cell centres of a box; the reply comes in parts."""
+
+    schema: ClassVar[str] = "pot.grid_query.v1"
+
+    lower: Vector3  # m, map frame; the box's corner, cell (0, 0, 0) starts here
+    upper: Vector3  # m, map frame; above `lower` on every axis
+    resolution: Positive  # m, cell edge
+    deadline_ms: Positive | None = None  # ms from arrival; past it the work is not started
+
+
+class GridPart(Message, frozen=True, kw_only=True):
+    """One run of cells of a grid, in C order of (x, y, z) indices; all parts come from one map revision."""
+
+    schema: ClassVar[str] = "pot.grid_part.v1"
+
+    part: Count  # 0 .. n_parts - 1; parts may arrive in any order
+    n_parts: PositiveCount  # how many parts the whole reply has
+    shape: GridShape  # cells along x, y, z of the whole grid
+    first_cell: Count  # flat index of this part's first cell
+    lower: Vector3  # m, map frame; cell (i, j, k) is centred at lower + (i + .5, j + .5, k + .5) * resolution
+    resolution: Positive  # m, cell edge
+    occupancy: Occupancy  # of the cells first_cell, first_cell + 1, ...
+
+
+class ParamsQuery(Message, frozen=True, kw_only=True):
+    """`q/params`: the kernels of the overall map, whole or inside a box; the reply comes in parts."""
+
+    schema: ClassVar[str] = "pot.params_query.v1"
+
+    lower: Vector3 | None = None  # m, map frame, on hinge means
+    upper: Vector3 | None = None  # m, map frame; give both corners or neither
+    deadline_ms: Positive | None = None  # ms from arrival; past it the work is not started
+
+
+class ParamsPart(Message, frozen=True, kw_only=True):
+    """One part of a `q/params` reply."""
+
+    schema: ClassVar[str] = "pot.params_part.v1"
+
+    part: Count  # 0 .. n_parts - 1; parts may arrive in any order
+    n_parts: PositiveCount  # how many parts the whole reply has
+    map_revision: Count  # the same in all parts
+    kernels: Kernels  # this part's kernels; the origin may differ from part to part
+
+
+class AtomsQuery(Message, frozen=True, kw_only=True):
+    """`q/atoms`: list the dictionary, or fetch one atom whole."""
+
+    schema: ClassVar[str] = "pot.atoms_query.v1"
+
+    atom_id: str | None = None  # absent = list all
+
+
+class AtomInfo(msgspec.Struct, frozen=True, kw_only=True):
+    """One line of the dictionary's table."""
+
+    atom_id: str  # its name in the dictionary
+    dims: Dims  # 2 or 3
+    n_hits: Count  # echoes it was learned from
+    n_free: Count  # free-space samples it was learned from
+    n_kernels: Count  # kernels it carries
+    radius_m: Positive  # m, of the sector
+    azimuth_width_rad: Positive  # rad, opening of the sector
+    times_used: Count  # sectors this atom has served since the server started
+    provenance: dict[str, str]  # source, scan, sector, licence, learner, held-out scores
+
+
+class AtomList(Message, frozen=True, kw_only=True):
+    """The reply to an `AtomsQuery` without an id."""
+
+    schema: ClassVar[str] = "pot.atom_list.v1"
+
+    atoms: list[AtomInfo]  # in dictionary order
+
+
+class Atom(Message, frozen=True, kw_only=True):
+    """One atom whole: the reply to an `AtomsQuery` with an id."""
+
+    schema: ClassVar[str] = "pot.atom.v1"
+
+    info: AtomInfo  # its line in the table
+    hit_points: Array  # (H, 3) float32, m, atom frame: sensor at the origin, x along the sector's bisector
+    free_points: Array  # (F, 3) float32, m, atom frame
+    kernels: Kernels  # atom frame
+
+
+class InfoQuery(Message, frozen=True, kw_only=True):
+    """`q/info`; an empty payload is taken as this message."""
+
+    schema: ClassVar[str] = "pot.info_query.v1"
+
+
+class Limits(msgspec.Struct, frozen=True, kw_only=True):
+    """What the server accepts; a client may check before it sends."""
+
+    max_cloud_bytes: Count  # of one cloud's payload
+    max_cloud_points: Count  # beams in one cloud
+    max_query_bytes: Count  # of one query's payload
+    max_query_points: Count  # in one `q/points`
+    max_grid_cells: Count  # in one `q/grid`
+    max_range_m: Finite  # m, beams are used up to here
+    max_coordinate_m: Finite  # m, |x|, |y|, |z| in the map frame
+
+
+class Info(Message, frozen=True, kw_only=True):
+    """What this server is and what it holds."""
+
+    schema: ClassVar[str] = "pot.info.v1"
+
+    server: Identifier  # its id in the key space
+    version: str  # of the software
+    map: Identifier  # the map that was asked
+    maps: list[Identifier]  # all maps of this server
+    profile: str  # of the mapper: default or paper
+    map_revision: Count  # now
+    n_kernels: Count  # in the overall map
+    n_atoms: Count  # in the dictionary
+    n_scans: Count  # integrated into this map
+    lower: Vector3 | None  # m, map frame; bounds of the hinge means, none while the map is empty
+    upper: Vector3 | None  # m, map frame
+    tile_size_m: Positive  # m, edge of a tile
+    observed_activation: Finite  # summed activation below which a point is unobserved
+    prior_var: Finite  # log-odds^2, of the latent where nothing was observed
+    limits: Limits  # what the server accepts
+    started_ns: Sequence  # when the server started
+
+
+class StatsQuery(Message, frozen=True, kw_only=True):
+    """`srv/<server>/stats` as a query; an empty payload is taken as this message."""
+
+    schema: ClassVar[str] = "pot.stats_query.v1"
+
+
+class LatencySummary(msgspec.Struct, frozen=True, kw_only=True):
+    """Percentiles over the last window of one kind of work."""
+
+    count: Count  # of measurements in the window
+    p50_ms: Measured  # ms; not finite while count is 0
+    p95_ms: Measured  # ms
+    p99_ms: Measured  # ms
+    max_ms: Measured  # ms
+
+
+class Stats(Message, frozen=True, kw_only=True):
+    """Counters since start, and what the server is doing now: `srv/<server>/stats`, once a second."""
+
+    schema: ClassVar[str] = "pot.stats.v1"
+
+    server: Identifier  # its id in the key space
+    stamp_ns: Sequence  # when the counters were read
+    uptime_s: Finite  # s
+    state: str  # serving | draining
+    counters: dict[str, Count]  # e.g. clouds.accepted, clouds.rejected.bad_pose, queries.points.ok
+    queues: dict[str, Count]  # e.g. clouds.depth, clouds.bytes, queries.depth
+    latencies: dict[str, LatencySummary]  # e.g. integrate, points, grid
+    rss_bytes: Count  # resident memory of the process
+    map_kernels: dict[str, Count]  # kernels per map
+
+
+# --- control --------------------------------------------------------------------------------------
+
+
+class ControlRequest(Message, frozen=True, kw_only=True):
+    """`ctl/<verb>`; an empty payload is taken as this message."""
+
+    schema: ClassVar[str] = "pot.control.v1"
+
+    timeout_s: Positive | None = None  # s, how long the work may take; absent = the server's default
+
+
+class ControlReply(Message, frozen=True, kw_only=True):
+    """A control verb was carried out."""
+
+    schema: ClassVar[str] = "pot.control_reply.v1"
+
+    verb: str  # as in the key
+    map_revision: Count  # afterwards
+    message: str  # for people
+
+
+class ErrorCode(str, Enum):
+    """Everything that a client can act on; the code is contract, the text is not."""
+
+    BAD_MESSAGE = "bad_message"  # not MessagePack, truncated, too deep, another schema, wrong fields
+    BAD_ARRAY = "bad_array"  # dtype, shape or byte count
+    BAD_POSE = "bad_pose"  # not a rigid transform, or not finite
+    BAD_POINTS = "bad_points"  # NaN or infinite coordinates
+    EMPTY = "empty"  # nothing to do: no points, or none inside the range limits
+    TOO_LARGE = "too_large"  # bytes, points or cells beyond the limit
+    OUT_OF_RANGE = "out_of_range"  # coordinates beyond what the map can hold
+    OLD_STAMP = "old_stamp"  # not newer than the robot's last accepted cloud
+    NO_POSE = "no_pose"  # no pose given, and none to interpolate at the stamp
+    UNKNOWN_ROBOT = "unknown_robot"  # not a legal id, or not on the allow list
+    UNKNOWN_ATOM = "unknown_atom"  # not in the dictionary
+    UNSUPPORTED = "unsupported"  # no such operation or verb
+    OVERLOADED = "overloaded"  # the queue is full; retry after retry_after_s
+    DEADLINE = "deadline"  # the deadline passed before the work could start
+    SHUTTING_DOWN = "shutting_down"  # the server takes no more work
+    INTERNAL = "internal"  # a bug of the server; the traceback is in its log
+
+
+class ErrorReply(Message, frozen=True, kw_only=True):
+    """The payload of every `reply_err`."""
+
+    schema: ClassVar[str] = "pot.error.v1"
+
+    code: ErrorCode  # what to act on
+    message: str  # for people
+    retryable: bool = False  # the same request may succeed later
+    retry_after_s: WaitSeconds | None = None  # s, the least useful wait
+
+
+ALL_MESSAGES: tuple[type[Message], ...] = (
+    Cloud,
+    Pose,
+    Kernels,
+    Receipt,
+    Params,
+    Revision,
+    PointsQuery,
+    Occupancy,
+    GridQuery,
+    GridPart,
+    ParamsQuery,
+    ParamsPart,
+    AtomsQuery,
+    AtomList,
+    Atom,
+    InfoQuery,
+    Info,
+    StatsQuery,
+    Stats,
+    ControlRequest,
+    ControlReply,
+    ErrorReply,
+)

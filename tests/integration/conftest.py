@@ -1,0 +1,336 @@
+"""A raw Zenoh client that never waits without a deadline, servers on free ports, and a mapper that tests can hold still."""
+
+from __future__ import annotations
+
+import collections
+import contextlib
+import json
+import queue
+import threading
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+import zenoh
+
+from potschemas import messages, wire
+from potschemas.keys import MapKeys, stats_key
+from potserver.config import Settings, load_settings
+from potserver.domain.dictionary import AtomDictionary
+from potserver.domain.types import KernelSet, MapUpdate, Occupancy, Scan, TileChange
+from potserver.server import MapServer
+from potserver.services.query import QueryService
+from potserver.services.settings import MappingSettings
+
+DEADLINE_S = 30.0
+ROOT = "pot/v1"
+_BY_SCHEMA = {kind.schema: kind for kind in messages.ALL_MESSAGES}
+
+
+def until(condition: Callable[[], Any], what: str, deadline_s: float = DEADLINE_S) -> Any:
+    """Wait for a condition that nothing signals; its value."""
+    end = time.monotonic() + deadline_s
+    while not (value := condition()):
+        assert time.monotonic() < end, f"not within {deadline_s} s: {what}"
+        threading.Event().wait(0.005)
+    return value
+
+
+def decode_any(payload: zenoh.ZBytes, encoding: zenoh.Encoding) -> messages.Message:
+    """A message by the schema that its encoding names."""
+    mime, _, schema = str(encoding).partition(";")
+    assert mime == wire.MIME, encoding
+    return wire.decode(payload.to_bytes(), _BY_SCHEMA[schema])
+
+
+class Client:
+    """One Zenoh session in client mode, asking about one map."""
+
+    def __init__(self, endpoint: str, *, map_id: str = "default", root: str = ROOT) -> None:
+        config = zenoh.Config()
+        for key, value in {
+            "mode": "client",
+            "connect/endpoints": [endpoint],
+            "scouting/multicast/enabled": False,
+            # as the server does: replies over shared memory are not safe
+            "transport/shared_memory/transport_optimization/messages": ["put"],
+        }.items():
+            config.insert_json5(key, json.dumps(value))
+        self.session = zenoh.open(config)
+        self.keys = MapKeys(root, map_id)
+        self._publishers: dict[str, zenoh.Publisher] = {}
+
+    def close(self) -> None:
+        self.session.close()
+
+    def get(
+        self, key: str, payload: Any = None, *, encoding: str | None = None, timeout_s: float = DEADLINE_S
+    ) -> list[messages.Message]:
+        """All replies to a query, errors among them; an empty list means that nobody answered."""
+        if isinstance(payload, messages.Message):
+            encoding = encoding or wire.encoding_of(payload)
+            payload = wire.encode(payload)
+        replies = self.session.get(
+            key, payload=payload, encoding=encoding, timeout=timeout_s, consolidation=zenoh.ConsolidationMode.NONE
+        )
+        answers = []
+        for reply in replies:
+            answer = reply.ok or reply.err
+            assert answer is not None
+            assert answer.payload.to_bytes() != b"Timeout", f"{key}: timed out"
+            answers.append(decode_any(answer.payload, answer.encoding))
+        return answers
+
+    def ask(self, op: str, payload: Any = None, **options: Any) -> list[messages.Message]:
+        """All replies to `q/<op>`; at least one."""
+        answers = self.get(self.keys.query(op), payload, **options)
+        assert answers, f"nobody answered {op}"
+        return answers
+
+    def one(self, op: str, payload: Any = None, **options: Any) -> Any:
+        """The only reply to `q/<op>`, which is not an error."""
+        (answer,) = self.ask(op, payload, **options)
+        assert not isinstance(answer, messages.ErrorReply), answer
+        return answer
+
+    def error(self, op: str, payload: Any = None, **options: Any) -> messages.ErrorReply:
+        """The error that `q/<op>` ends in."""
+        (answer,) = self.ask(op, payload, **options)
+        assert isinstance(answer, messages.ErrorReply), answer
+        return answer
+
+    def control(self, verb: str, payload: Any = None) -> Any:
+        """The only reply to `ctl/<verb>`."""
+        (answer,) = self.get(self.keys.control(verb), payload)
+        return answer
+
+    def stats(self, server_id: str = "potserver") -> messages.Stats:
+        """The server's counters now."""
+        (answer,) = self.get(stats_key(self.keys.root, server_id))
+        assert isinstance(answer, messages.Stats)
+        return answer
+
+    def listen(self, key: str) -> queue.Queue[Any]:
+        """Messages on a key from now on."""
+        inbox: queue.Queue[Any] = queue.Queue()
+        self.session.declare_subscriber(key, lambda s: inbox.put(decode_any(s.payload, s.encoding)))
+        self.ask("info")  # a round trip: the server has seen the declaration
+        return inbox
+
+    def receipts(self, robot: str = "*") -> queue.Queue[messages.Receipt]:
+        """Receipts of a robot from now on."""
+        return self.listen(self.keys.receipt(robot))
+
+    def put(self, key: str, payload: bytes, encoding: str | None = None) -> None:
+        """Publish, once somebody listens."""
+        publisher = self._publishers.get(key)
+        if publisher is None:
+            publisher = self._publishers[key] = self.session.declare_publisher(
+                key, congestion_control=zenoh.CongestionControl.BLOCK, priority=zenoh.Priority.DATA_LOW
+            )
+        until(lambda: publisher.matching_status.matching, f"a subscriber of {key}")
+        publisher.put(payload, encoding=encoding)
+
+    def put_cloud(self, cloud: messages.Cloud, robot: str = "r1") -> None:
+        """Publish a cloud."""
+        self.put(self.keys.cloud(robot), wire.encode(cloud), wire.encoding_of(cloud))
+
+    def alive(self, key: str) -> list[str]:
+        """Liveliness tokens now."""
+        return [str(r.ok.key_expr) for r in self.session.liveliness().get(key, timeout=DEADLINE_S) if r.ok]
+
+
+def make_cloud(seq: int = 0, **changes: Any) -> messages.Cloud:
+    """A small room seen from its middle, one metre above the floor."""
+    rng = np.random.default_rng(5)
+    angle = rng.uniform(-np.pi, np.pi, 600)
+    walls = np.stack([6 * np.cos(angle), 5 * np.sin(angle), rng.uniform(-1, 2, 600)], axis=1)
+    fields: dict[str, Any] = {
+        "seq": seq,
+        "stamp_ns": 1_000_000_000 + seq * 100_000_000,
+        "points": wire.encode_array(walls.astype(np.float32)),
+        "T_map_sensor": wire.encode_array(np.eye(4)),
+    }
+    return messages.Cloud(**fields | changes)
+
+
+def points_query(points: Any, **changes: Any) -> messages.PointsQuery:
+    """Ask at these points."""
+    return messages.PointsQuery(points=wire.encode_array(np.asarray(points, np.float64)), **changes)
+
+
+# --- a mapper without mathematics, that can be held -------------------------------------------------------------------
+
+
+class FakeSnapshot:
+    observed_activation = 0.05
+    prior_var = 50.0
+
+    def __init__(self, owner: FakeMapper, kernels: KernelSet, map_revision: int) -> None:
+        self._owner, self.kernels, self.map_revision = owner, kernels, map_revision
+
+    def __len__(self) -> int:
+        return len(self.kernels)
+
+    def occupancy(self, points: Any) -> Occupancy:
+        self._owner.queries.pass_through()
+        n = len(points)
+        return Occupancy(
+            mean=np.full(n, 0.5),
+            var=np.full(n, 0.1),
+            latent_mean=np.zeros(n, np.float32),
+            latent_var=np.full(n, 50.0, np.float32),
+            observed=np.zeros(n, bool),
+            map_revision=self.map_revision,
+        )
+
+
+class Gate:
+    """Where a test can hold the threads of a server."""
+
+    def __init__(self) -> None:
+        self._open = threading.Event()
+        self._open.set()
+        self.entered: queue.Queue[int] = queue.Queue()
+
+    def hold(self) -> None:
+        self._open.clear()
+
+    def release(self) -> None:
+        self._open.set()
+
+    def wait_entered(self) -> None:
+        self.entered.get(timeout=DEADLINE_S)
+
+    def pass_through(self) -> None:
+        self.entered.put(1)
+        assert self._open.wait(DEADLINE_S), "the test never released the gate"
+
+
+class FakeMapper:
+    """Takes every fifth point as a kernel."""
+
+    def __init__(self) -> None:
+        self.settings = MappingSettings()
+        self.dictionary = AtomDictionary(())
+        self.atom_usage: collections.Counter[str] = collections.Counter()
+        self.n_scans = 0
+        self.snapshot = FakeSnapshot(self, KernelSet.empty(), 0)
+        self.scans: list[Scan] = []
+        self.failure: Exception | None = None
+        self.mapping, self.queries, self.warming = Gate(), Gate(), Gate()
+
+    def integrate(self, scan: Scan) -> MapUpdate:
+        self.mapping.pass_through()
+        if self.failure is not None:
+            raise self.failure
+        self.scans.append(scan)
+        points = (scan.points @ scan.T_map_sensor[:3, :3].T + scan.T_map_sensor[:3, 3])[::5]
+        k = len(points)
+        one = np.ones(k, np.float32)
+        kernels = KernelSet(
+            hinge_mean=points.astype(np.float64),
+            hinge_var=np.ones((k, 3), np.float32),
+            gamma_shape=one,
+            gamma_rate=one,
+            weight_mean=one,
+            weight_var=one,
+        )
+        whole = KernelSet.concatenate([self.snapshot.kernels, kernels])
+        self.snapshot = FakeSnapshot(self, whole, self.snapshot.map_revision + 1)
+        self.n_scans += 1
+        return MapUpdate(
+            map_revision=self.snapshot.map_revision,
+            kernels=kernels,
+            sectors=[],
+            n_points=len(scan.points),
+            n_kernels_added=k,
+            map_kernels=len(whole),
+            changed=TileChange(10.0, [(0, 0, 0)]),
+            timings_ms={},
+        )
+
+    def clear(self) -> None:
+        self.snapshot = FakeSnapshot(self, KernelSet.empty(), self.snapshot.map_revision + 1)
+        self.n_scans = 0
+
+    def warm_up(self) -> None:
+        self.warming.pass_through()
+
+
+class Rig:
+    """A server with fake mappers, and clients of it."""
+
+    def __init__(self, settings: Settings) -> None:
+        self.mappers = {map_id: FakeMapper() for map_id in settings.maps}
+        self.server = MapServer(settings, listen="tcp/127.0.0.1:0", make_map=self._make_map)
+        self._clients: list[Client] = []
+
+    @property
+    def mapper(self) -> FakeMapper:
+        return self.mappers["default"]
+
+    def client(self, **options: Any) -> Client:
+        client = Client(self.server.endpoint, **options)
+        self._clients.append(client)
+        return client
+
+    def close(self) -> None:
+        for mapper in self.mappers.values():
+            for gate in (mapper.mapping, mapper.queries, mapper.warming):
+                gate.release()
+        for client in self._clients:
+            client.close()
+        self.server.stop()
+
+    def _make_map(self, map_id: str) -> tuple[Any, Any]:
+        mapper: Any = self.mappers[map_id]
+        return mapper, QueryService(mapper, max_points=1000, max_grid_cells=100_000, max_coordinate_m=1e6)
+
+
+@pytest.fixture
+def make_rig() -> Iterator[Callable[..., Rig]]:
+    """Makes servers with fake mappers; keyword arguments are dotted settings with `__` for the dot."""
+    with contextlib.ExitStack() as stack:
+
+        def make(*, start: bool = True, **changes: Any) -> Rig:
+            overrides = {key.replace("__", "."): value for key, value in changes.items()}
+            rig = Rig(load_settings(overrides=overrides))
+            stack.callback(rig.close)
+            if start:
+                rig.server.start()
+            return rig
+
+        yield make
+
+
+@pytest.fixture(scope="session")
+def real_server() -> Iterator[MapServer]:
+    """One server with the real mapper, for tests that leave its map as it was."""
+    settings = load_settings(
+        overrides={
+            "mapping.max_range_m": 15.0,
+            "mapping.beams_per_scan": 1000,
+            "limits.max_cloud_bytes": 200_000,
+            "limits.max_cloud_points": 5000,
+            "limits.max_query_bytes": 100_000,
+            "limits.max_query_points": 2000,
+            "limits.max_grid_cells": 50_000,
+            "limits.max_coordinate_m": 1e6,
+            "queries.grid_part_cells": 4096,
+        }
+    )
+    with MapServer(settings, listen="tcp/127.0.0.1:0") as server:
+        yield server
+
+
+@pytest.fixture
+def real_client(real_server: MapServer) -> Iterator[Client]:
+    """A client of `real_server`, whose map holds at least one scan."""
+    client = Client(real_server.endpoint)
+    if client.one("info").n_scans == 0:
+        client.one("integrate", make_cloud(robot="base"))
+    yield client
+    client.close()

@@ -1,0 +1,145 @@
+"""`potserver serve` as a process of its own: ready line, clean drain on SIGTERM, and errors of one line."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import queue
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from potschemas import wire
+from potschemas.messages import ReceiptStatus
+
+from .conftest import DEADLINE_S, Client, make_cloud, until
+
+START_S = 120.0  # the first start on a machine compiles
+
+
+class Process:
+    """A `potserver` command whose JSON log is read as it comes."""
+
+    def __init__(self, *arguments: str) -> None:
+        environ = {k: v for k, v in os.environ.items() if not k.startswith(("POTSERVER_", "ZENOH_"))}
+        self.popen = subprocess.Popen(
+            [sys.executable, "-m", "potserver.cli", *arguments],
+            stderr=subprocess.PIPE,
+            stdout=subprocess.DEVNULL,
+            text=True,
+            env=environ,
+        )
+        self.lines: list[str] = []
+        self._events: queue.Queue[dict[str, Any]] = queue.Queue()
+        self._reader = threading.Thread(target=self._read, daemon=True)
+        self._reader.start()
+
+    def _read(self) -> None:
+        assert self.popen.stderr is not None
+        for line in self.popen.stderr:
+            self.lines.append(line)
+            with contextlib.suppress(ValueError):
+                self._events.put(json.loads(line))
+
+    def event(self, name: str, timeout_s: float = DEADLINE_S) -> dict[str, Any]:
+        """Wait for an event of the log."""
+        while True:
+            try:
+                event = self._events.get(timeout=timeout_s)
+            except queue.Empty:
+                raise AssertionError(f"no event {name}:\n" + "".join(self.lines)) from None
+            if event["event"] == name:
+                return event
+
+    def wait(self) -> int:
+        """The exit code."""
+        code = self.popen.wait(DEADLINE_S)
+        self._reader.join(DEADLINE_S)
+        return code
+
+    def close(self) -> None:
+        if self.popen.poll() is None:
+            self.popen.kill()
+        self.wait()
+        assert self.popen.stderr is not None
+        self.popen.stderr.close()
+
+
+@pytest.fixture
+def serve(tmp_path: Path) -> Iterator[Any]:
+    """Starts `potserver serve` and waits until it is ready."""
+    with contextlib.ExitStack() as stack:
+
+        def start(*arguments: str, ready: bool = True) -> tuple[Process, str]:
+            file = tmp_path / "settings.toml"
+            file.write_text("[mapping]\nmax_range_m = 15.0\nbeams_per_scan = 500\n")
+            process = Process(
+                "serve", "--settings", str(file), "--log-format", "json", "--listen", "tcp/127.0.0.1:0", *arguments
+            )
+            stack.callback(process.close)
+            endpoint = process.event("server_started", START_S)["endpoints"][0] if ready else ""
+            return process, endpoint
+
+        yield start
+
+
+def test_sigterm_maps_what_waits_answers_everybody_and_exits_with_zero(serve: Any) -> None:
+    process, endpoint = serve()
+    client = Client(endpoint)
+    receipts = client.receipts("r1")
+    n = 8
+    for seq in range(n):
+        client.put_cloud(make_cloud(seq=seq))
+    until(lambda: client.stats().counters.get("clouds.received") == n, "all clouds received")
+    process.popen.send_signal(signal.SIGTERM)
+    assert process.wait() == 0, "".join(process.lines)
+    got = [receipts.get(timeout=DEADLINE_S) for _ in range(n)]
+    assert [(r.seq, r.status) for r in got] == [(seq, ReceiptStatus.ACCEPTED) for seq in range(n)]
+    assert client.get(client.keys.query("info")) == []
+    client.close()
+    stopped = process.event("server_stopped")
+    assert stopped["clean"] is True
+    assert stopped["counters"]["clouds.accepted"] == n
+    assert "Traceback" not in "".join(process.lines)
+
+
+def test_sigint_on_an_idle_server_exits_with_zero(serve: Any) -> None:
+    process, _ = serve("--map", "a", "--map", "b")
+    process.popen.send_signal(signal.SIGINT)
+    assert process.wait() == 0
+    assert process.event("stop_requested")["signal"] == "SIGINT"
+
+
+def test_a_second_signal_ends_it_at_once(serve: Any) -> None:
+    process, endpoint = serve("--drain-timeout", "600", "--set", "intake.max_queued=400")
+    client = Client(endpoint)
+    payload, encoding = wire.encode(make_cloud()), wire.encoding_of(make_cloud())
+    # clouds without an accepted stamp cannot overtake each other: enough work for several drains
+    for seq in range(200):
+        client.put(client.keys.cloud(f"r{seq}"), payload, encoding)
+    until(lambda: client.stats().counters.get("clouds.received") == 200, "all clouds received")
+    process.popen.send_signal(signal.SIGTERM)
+    process.event("server_draining")
+    process.popen.send_signal(signal.SIGTERM)
+    assert process.wait() == 130
+    assert "second signal" in process.lines[-1]
+    client.close()
+
+
+def test_a_taken_port_is_one_line_and_exit_code_two(serve: Any) -> None:
+    process, endpoint = serve()
+    other = Process("serve", "--listen", endpoint, "--log-level", "error")
+    assert other.wait() == 2
+    other.close()
+    (line,) = other.lines
+    assert "the port is taken" in line
+    assert "Hint" in line
+    process.popen.send_signal(signal.SIGTERM)
+    assert process.wait() == 0

@@ -1,0 +1,161 @@
+"""The container files name what exists: paths, commands, flags, pinned images, a user that is not root.
+
+No container engine is needed: the files are read, and the commands are asked for their help.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+import yaml
+
+from potschemas import __version__
+
+DOCKERFILES = ["server.Dockerfile", "client.Dockerfile"]
+
+
+class Instruction(NamedTuple):
+    """One line of a Dockerfile, continuation lines joined."""
+
+    word: str
+    rest: str
+
+
+def instructions(path: Path) -> list[Instruction]:
+    lines = [line for line in path.read_text().splitlines() if not line.lstrip().startswith("#")]
+    joined = re.sub(r"\\\n\s*", " ", "\n".join(lines))
+    return [Instruction(*line.split(maxsplit=1)) for line in joined.splitlines() if line.strip()]
+
+
+def last_stage(path: Path) -> list[Instruction]:
+    found = instructions(path)
+    start = max(i for i, instruction in enumerate(found) if instruction.word == "FROM")
+    return found[start:]
+
+
+def command_of(found: list[Instruction], word: str) -> list[str]:
+    """The last ENTRYPOINT or CMD, which must be in exec form."""
+    lines = [instruction.rest for instruction in found if instruction.word == word]
+    return json.loads(lines[-1]) if lines else []
+
+
+@pytest.fixture(scope="module", params=DOCKERFILES)
+def dockerfile(request: pytest.FixtureRequest, root: Path) -> Path:
+    return root / "docker" / request.param
+
+
+@pytest.fixture(scope="module")
+def compose(root: Path) -> dict:
+    return yaml.safe_load((root / "docker" / "compose.yaml").read_text())
+
+
+def test_every_copied_path_exists_and_is_in_the_build_context(root: Path, dockerfile: Path) -> None:
+    let_through = {
+        line[1:] for line in (root / ".dockerignore").read_text().splitlines() if line.startswith("!")
+    }
+    n_copied = 0
+    for instruction in instructions(dockerfile):
+        assert instruction.word != "ADD"
+        if instruction.word == "COPY" and "--from=" not in instruction.rest:
+            *sources, _ = (word for word in instruction.rest.split() if not word.startswith("--"))
+            for source in sources:
+                assert (root / source).exists(), source
+                assert source.split("/")[0] in let_through, f"{source} is kept out by .dockerignore"
+                n_copied += 1
+    assert n_copied > 0
+
+
+def test_stages_that_are_copied_from_exist(dockerfile: Path) -> None:
+    found = instructions(dockerfile)
+    stages = {match[1] for _, rest in found if (match := re.search(r"\bAS (\w+)$", rest))}
+    copied_from = {match[1] for _, rest in found if (match := re.search(r"--from=(\w+)", rest))}
+    assert copied_from <= stages
+
+
+def test_the_base_image_is_pinned(dockerfile: Path) -> None:
+    images = [
+        instruction.rest.split()[0] for instruction in instructions(dockerfile) if instruction.word == "FROM"
+    ]
+    assert images
+    for image in images:
+        assert re.fullmatch(r"python:3\.\d+(\.\d+)?-slim-\w+(@sha256:[0-9a-f]{64})?", image), image
+
+
+def test_packages_are_pinned_by_the_constraints(dockerfile: Path) -> None:
+    installs = [rest for word, rest in instructions(dockerfile) if word == "RUN" and "pip install" in rest]
+    assert installs
+    assert all("-c constraints.txt" in line for line in installs)
+
+
+def test_the_client_image_takes_the_client_only(root: Path) -> None:
+    rest = " ".join(instruction.rest for instruction in instructions(root / "docker" / "client.Dockerfile"))
+    assert "./clients" in rest
+    assert "potserver" not in rest
+
+
+def test_the_user_is_not_root_and_exists(dockerfile: Path) -> None:
+    stage = last_stage(dockerfile)
+    users = [instruction.rest for instruction in stage if instruction.word == "USER"]
+    assert users
+    assert users[-1] not in ("root", "0")
+    assert any(
+        word == "RUN" and rest.startswith("useradd") and rest.split()[-1] == users[-1] for word, rest in stage
+    )
+    order = [instruction.word for instruction in stage]
+    assert "RUN" not in order[order.index("USER") :]
+
+
+def test_the_image_starts_a_command_of_ours(
+    dockerfile: Path, command_faults: Callable[[list[str]], list[str]]
+) -> None:
+    stage = last_stage(dockerfile)
+    words = command_of(stage, "ENTRYPOINT") + command_of(stage, "CMD")
+    assert words
+    assert command_faults(words) == []
+
+
+def test_the_server_says_whether_it_is_healthy(
+    root: Path, command_faults: Callable[[list[str]], list[str]]
+) -> None:
+    stage = last_stage(root / "docker" / "server.Dockerfile")
+    (check,) = (instruction.rest for instruction in stage if instruction.word == "HEALTHCHECK")
+    words = json.loads(check[check.index("CMD") + len("CMD") :])
+    assert command_faults(words) == []
+
+
+def test_every_service_builds_from_a_dockerfile_and_runs_its_command(
+    root: Path, compose: dict, command_faults: Callable[[list[str]], list[str]]
+) -> None:
+    assert set(compose["services"]) == {"server", "load"}
+    for service in compose["services"].values():
+        context = root / "docker" / service["build"]["context"]
+        dockerfile = context / service["build"]["dockerfile"]
+        assert context.resolve() == root
+        entrypoint = command_of(last_stage(dockerfile), "ENTRYPOINT")
+        assert command_faults(entrypoint + service["command"]) == []
+
+
+def test_services_depend_on_each_other_as_they_can(root: Path, compose: dict) -> None:
+    services = compose["services"]
+    assert services["load"]["depends_on"]["server"]["condition"] == "service_healthy"
+    server = instructions(root / "docker" / "server.Dockerfile")
+    assert any(instruction.word == "HEALTHCHECK" for instruction in server)
+    ports = {instruction.rest for instruction in server if instruction.word == "EXPOSE"}
+    assert {port.rsplit(":", 1)[1] for port in services["server"]["ports"]} == ports
+    for service in services.values():
+        volumes = {volume.split(":")[0] for volume in service.get("volumes", [])}
+        assert volumes <= set(compose["volumes"])
+        for word in service["command"]:
+            for host, port in re.findall(r"tcp/([\w.]+):(\d+)", word):
+                assert host in {*services, "0.0.0.0", "127.0.0.1"}
+                assert port in ports
+
+
+def test_image_tags_are_the_version(compose: dict) -> None:
+    for service in compose["services"].values():
+        assert service["image"].partition(":")[2] == __version__

@@ -1,0 +1,374 @@
+"""The client's command line: what it prints, what it returns, and that every mistake is one clear line."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import zenoh
+
+from potclient.cli import build_parser, main
+from potclient.errors import NoServerError, UsageError
+from potclient.kernels import KernelSet
+from potclient.session import (
+    DEFAULT_ENDPOINT,
+    SessionOptions,
+    add_zenoh_arguments,
+    build_config,
+    open_session,
+    options_from_arguments,
+)
+from potschemas.messages import ErrorCode, ReceiptStatus
+from tests.integration.fake_server import FakeServer, free_port
+
+COMMANDS = ("publish", "query", "grid", "watch", "load", "info", "atoms", "control")
+
+
+@pytest.fixture(scope="module")
+def server() -> Any:
+    with FakeServer() as server:
+        yield server
+
+
+@pytest.fixture(autouse=True)
+def fresh(server: FakeServer) -> None:
+    server.script.receipts = lambda cloud: ReceiptStatus.ACCEPTED
+    server.script.fail.clear()
+    server.script.fail_once.clear()
+
+
+class Run:
+    """One command line run in this process."""
+
+    def __init__(self, capsys: pytest.CaptureFixture[str], server: FakeServer) -> None:
+        self._capsys, self._server = capsys, server
+
+    def __call__(self, *words: str, connect: bool = True) -> tuple[int, str, str]:
+        endpoint = ("-e", self._server.endpoint) if connect else ()
+        status = main([*words, *endpoint])
+        captured = self._capsys.readouterr()
+        return status, captured.out, captured.err
+
+
+@pytest.fixture
+def run(capsys: pytest.CaptureFixture[str], server: FakeServer) -> Run:
+    return Run(capsys, server)
+
+
+# --- help and usage ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help_teaches(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main([command, "--help"])
+    assert ended.value.code == 0
+    text = capsys.readouterr().out
+    assert "--connect" in text
+    assert "--map" in text
+    assert "%" not in re.sub(r"\d+ ?%", "", text), "argparse formats %; none may be left over"
+    if command != "info":
+        assert f"potclient {command}" in text.split("examples:")[1]
+
+
+def test_help_without_a_command_and_version(capsys: pytest.CaptureFixture[str]) -> None:
+    for flag, expected in (("--help", "potclient publish generated"), ("--version", "potclient ")):
+        with pytest.raises(SystemExit) as ended:
+            main([flag])
+        assert ended.value.code == 0
+        assert expected in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        [],
+        ["fly"],
+        ["publish"],
+        ["publish", "x", "--rate", "0"],
+        ["publish", "x", "--rate", "5", "--as-fast"],
+        ["publish", "x", "--drop", "--acknowledged"],
+        ["grid", "--lower", "0", "0"],
+        ["load", "--hz", "nan"],
+    ],
+)
+def test_wrong_usage_ends_with_status_2(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(words)
+    assert ended.value.code == 2
+    assert "Traceback" not in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["publish", "/nonexistent"], "no such file"),
+        (["publish", "generated", "--limit", "0"], "--limit"),
+        (["publish", "generated", "--skip", "1000"], "leaves none"),
+        (["publish", "generated", "--hold-out", "2"], "fraction"),
+        (["publish", "generated", "--robot", "No Way"], "robot"),
+        (["query"], "give coordinates"),
+        (["query", "1", "2"], "not whole points"),
+        (["query", "1", "2", "nan"], "NaN"),
+        (["grid", "--resolution", "1"], "-o FILE or --png FILE"),
+        (
+            ["grid", "--resolution", "1", "--lower", "1", "1", "1", "--upper", "0", "0", "0", "-o", "x"],
+            "lower",
+        ),
+        (["atoms", "-o", "x.npz"], "name its ID"),
+        (["info", "--map", "No Way"], "not an id"),
+        (["info", "--cfg", "nonsense"], "KEY:VALUE"),
+        (["info", "--cfg", "no/such/key:1"], "no/such/key"),
+        (["info", "--cfg", "mode:teapot"], "mode"),
+        (["info", "-c", "/nonexistent.json5"], "nonexistent"),
+        (["load", "--robots", "0", "--planners", "0"], "at least one"),
+        (["load", "--points", "0"], "at least one point"),
+    ],
+)
+def test_mistakes_are_one_clear_line_and_status_2(run: Run, words: list[str], message: str) -> None:
+    status, out, err = run(*words)
+    assert status == 2
+    assert message in err
+    lines = [line for line in err.splitlines() if line.startswith("potclient: ")]
+    assert len(lines) == 1
+    assert "Traceback" not in err + out
+
+
+def test_no_server_is_status_1_with_a_hint(run: Run) -> None:
+    status, _, err = run("info", "-e", f"tcp/127.0.0.1:{free_port()}", connect=False)
+    assert status == 1
+    assert "potserver serve" in err
+    assert err.count("\n") == 1
+
+
+def test_what_the_server_refuses_is_status_1_with_its_code(run: Run, server: FakeServer) -> None:
+    server.script.fail["points"] = ErrorCode.OUT_OF_RANGE
+    status, _, err = run("query", "1", "2", "3")
+    assert status == 1
+    assert "out_of_range" in err
+
+
+def test_unwritable_files_are_one_line(run: Run, tmp_path: Path) -> None:
+    status, _, err = run("query", "1", "2", "3", "-o", str(tmp_path / "absent" / "x.npz"))
+    assert status == 1
+    assert "No such file" in err
+    assert err.count("\n") == 1
+
+
+# --- commands ------------------------------------------------------------------------------------------------------
+
+
+def test_publish_shows_a_receipt_a_scan_and_scores_held_out_beams(run: Run, tmp_path: Path) -> None:
+    target = tmp_path / "report.json"
+    status, out, err = run(
+        "publish", "generated:2d", "--limit", "3", "--hold-out", "0.2", "--clear", "--json", str(target)
+    )
+    assert status == 0
+    assert out.count("accepted") == 4, "three receipts and the summary"
+    assert "3 of 3 scans accepted" in out
+    assert re.search(r"ACC 0\.\d+  AUC 0\.\d+  NLL \d", out)
+    assert "made-up 2D scene" in err
+    report = json.loads(target.read_text())
+    assert report["counts"]["accepted"] == 3
+    assert [s["status"] for s in report["scans"]] == ["accepted"] * 3
+    assert set(report["held_out"]) == {"n", "accuracy", "auc", "nll", "brier", "ece", "share_unknown"}
+
+
+@pytest.mark.parametrize("how", [[], ["--acknowledged"], ["--drop", "--rate", "100"]])
+def test_publish_fails_if_a_scan_is_not_accepted(run: Run, server: FakeServer, how: list[str]) -> None:
+    server.script.receipts = lambda cloud: ReceiptStatus.REJECTED
+    status, out, _ = run("publish", "generated:2d", "--limit", "2", *how)
+    assert status == 1
+    assert "0 of 2 scans accepted" in out
+    assert "overloaded: scripted" in out
+
+
+def test_publish_fails_if_a_scan_has_no_receipt(run: Run, server: FakeServer) -> None:
+    server.script.receipts = lambda cloud: None
+    status, out, _ = run("publish", "generated:2d", "--limit", "2", "--receipt-timeout", "0.1", "-q")
+    assert status == 1
+    assert "2 unknown" in out
+
+
+def test_query_in_its_forms(run: Run, tmp_path: Path) -> None:
+    status, out, _ = run("query", "1", "2", "-0.5", "3", "4", "5")
+    assert status == 0
+    assert "P(occupied)" in out
+    assert len(out.splitlines()) == 4
+    points = np.random.default_rng(0).normal(size=(30, 3))
+    np.save(tmp_path / "p.npy", points)
+    np.savetxt(tmp_path / "p.txt", points[:, :2])
+    status, out, _ = run("query", "--file", str(tmp_path / "p.npy"), "-o", str(tmp_path / "a.npz"))
+    assert status == 0
+    assert "and 10 more" in out
+    with np.load(tmp_path / "a.npz") as answers:
+        assert answers["mean"].shape == answers["observed"].shape == (30,)
+    status, out, _ = run("query", "--file", str(tmp_path / "p.txt"), "--json", "-")
+    assert status == 0
+    assert len(json.loads(out)["mean"]) == 30
+    (tmp_path / "bad.npy").write_bytes(b"nonsense")
+    status, _, err = run("query", "--file", str(tmp_path / "bad.npy"))
+    assert status == 2
+    assert "not an array of points" in err
+
+
+def test_grid_writes_a_file_and_a_picture(run: Run, tmp_path: Path) -> None:
+    out_file, picture = tmp_path / "g.npz", tmp_path / "g.png"
+    box = ("--lower", "-1", "-1", "0", "--upper", "1", "1", "1", "--resolution", "0.5")
+    status, out, _ = run("grid", *box, "-o", str(out_file), "--png", str(picture))
+    assert status == 0
+    assert "4 x 4 x 2 cells" in out
+    with np.load(out_file) as grid:
+        assert grid["mean"].shape == (4, 4, 2)
+        assert float(grid["resolution"]) == 0.5
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    status, _, err = run("grid", *box, "--png", str(picture), "--level", "9")
+    assert status == 2
+    assert "outside the grid" in err
+    status, _, err = run("grid", "--resolution", "0.5", "-o", str(out_file))
+    assert status == 2, "the fake server gives no bounds"
+    assert "the map is empty" in err
+
+
+def test_info_atoms_and_control(run: Run, tmp_path: Path) -> None:
+    status, out, _ = run("info", "--stats")
+    assert status == 0
+    assert re.search(r"^server +fake$", out, re.MULTILINE)
+    assert "stats.uptime_s" in out
+    status, out, _ = run("info", "--json", "-")
+    assert json.loads(out)["server"] == "fake"
+    status, out, _ = run("atoms")
+    assert status == 0
+    assert "wall.1" in out
+    status, out, _ = run("atoms", "wall.1", "-o", str(tmp_path / "k.npz"))
+    assert status == 0
+    assert "source: fake" in out
+    assert len(KernelSet.load(tmp_path / "k.npz")) == 2
+    status, out, _ = run("control", "clear")
+    assert status == 0
+    assert out.startswith("clear: cleared")
+
+
+def test_watch_ends_by_itself(run: Run) -> None:
+    status, out, err = run("watch", "--seconds", "0.05")
+    assert status == 0
+    assert "watching map default" in err
+    assert out == ""
+
+
+def test_load_prints_a_table_and_accounts_for_everything(run: Run, tmp_path: Path) -> None:
+    words = ("--robots", "1", "--planners", "1", "--hz", "40", "--seconds", "0.3", "--points", "50")
+    status, out, _ = run(
+        "load",
+        *words,
+        "--query-points",
+        "20",
+        "--dataset",
+        "generated:2d",
+        "--json",
+        str(tmp_path / "l.json"),
+    )
+    assert status == 0
+    assert "every cloud is accounted for" in out
+    assert re.search(r"^receipt +\d+ +[\d.]+ +[\d.]+ +[\d.]+ +[\d.]+$", out, re.MULTILINE)
+    report = json.loads((tmp_path / "l.json").read_text())
+    c = report["clouds"]
+    assert c["offered"] == sum(
+        c[k] for k in ("dropped_by_client", "accepted", "dropped", "rejected", "unknown")
+    )
+
+
+def test_load_fails_when_something_is_lost(run: Run, server: FakeServer) -> None:
+    server.script.receipts = lambda cloud: None
+    words = ("--robots", "1", "--planners", "0", "--hz", "20", "--seconds", "0.1", "--receipt-timeout", "0.1")
+    status, out, _ = run("load", *words, "--dataset", "generated:2d")
+    assert status == 1
+    assert "SOMETHING WAS LOST" in out
+
+
+def test_the_flags_of_all_commands_are_explained() -> None:
+    parsers = next(a for a in build_parser()._actions if isinstance(a, argparse._SubParsersAction)).choices
+    assert set(parsers) == set(COMMANDS)
+
+
+# --- sessions ------------------------------------------------------------------------------------------------------
+
+
+def options_of(*words: str) -> SessionOptions:
+    parser = argparse.ArgumentParser()
+    add_zenoh_arguments(parser)
+    return options_from_arguments(parser.parse_args(words))
+
+
+def value(config: zenoh.Config, key: str) -> Any:
+    return json.loads(config.get_json(key))
+
+
+SHM_MESSAGES = "transport/shared_memory/transport_optimization/messages"
+
+
+def test_the_default_is_a_quiet_client(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("ZENOH_CONFIG", raising=False)
+    config = build_config(options_of())
+    assert value(config, "mode") == "client"
+    assert value(config, "connect/endpoints") == [DEFAULT_ENDPOINT]
+    assert value(config, "scouting/multicast/enabled") is False
+    assert value(config, SHM_MESSAGES) == ["put"]
+    assert value(config, "transport/shared_memory/enabled") is True
+
+
+def test_flags_win_over_cfg_and_cfg_over_the_file_and_the_file_over_ours(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    file = tmp_path / "z.json5"
+    file.write_text(
+        '{mode: "peer", connect: {endpoints: ["tcp/127.0.0.1:1"]}, scouting: {multicast: {enabled: true}}}'
+    )
+    for config in (
+        build_config(options_of("-c", str(file))),
+        build_config_with_environment(monkeypatch, file),
+    ):
+        assert value(config, "mode") == "peer"
+        assert value(config, "connect/endpoints") == ["tcp/127.0.0.1:1"]
+        assert value(config, "scouting/multicast/enabled") is True
+        assert value(config, SHM_MESSAGES) == ["put"], "what the file leaves open is ours"
+    config = build_config(
+        options_of(
+            *("-c", str(file), "--cfg", 'mode:"router"', "--cfg", f'{SHM_MESSAGES}:["put", "query"]'),
+            *("-e", "tcp/127.0.0.1:2", "-e", "tcp/127.0.0.1:3", "--no-multicast-scouting"),
+        )
+    )
+    assert value(config, "mode") == "router"
+    assert value(config, SHM_MESSAGES) == ["put", "query"]
+    assert value(config, "connect/endpoints") == ["tcp/127.0.0.1:2", "tcp/127.0.0.1:3"]
+    assert value(config, "scouting/multicast/enabled") is False
+    config = build_config(
+        options_of("--cfg", 'mode:"router"', "-m", "peer", "--no-shm", "-l", "tcp/127.0.0.1:0")
+    )
+    assert value(config, "mode") == "peer"
+    assert value(config, "transport/shared_memory/enabled") is False
+    assert value(config, "listen/endpoints") == ["tcp/127.0.0.1:0"]
+
+
+def test_a_word_in_cfg_needs_no_quotes() -> None:
+    assert value(build_config(options_of("--cfg", "mode:peer")), "mode") == "peer"
+
+
+def build_config_with_environment(monkeypatch: pytest.MonkeyPatch, file: Path) -> zenoh.Config:
+    monkeypatch.setenv("ZENOH_CONFIG", str(file))
+    config = build_config(options_of())
+    monkeypatch.delenv("ZENOH_CONFIG")
+    return config
+
+
+def test_sessions_that_cannot_open_say_why() -> None:
+    with pytest.raises(NoServerError, match="nobody listens"):
+        open_session(SessionOptions(connect=(f"tcp/127.0.0.1:{free_port()}",)))
+    for endpoint in ("carrier-pigeon/127.0.0.1:1", "localhost:7447", "tcp/", ""):
+        with pytest.raises(UsageError, match="PROTOCOL/ADDRESS"):
+            open_session(SessionOptions(connect=(endpoint,)))

@@ -1,0 +1,148 @@
+"""What the documents say can be done: commands, code and links are checked against the project."""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import itertools
+import re
+import shlex
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+
+OURS = {"potserver", "potclient", "potschemas"}
+FENCE = re.compile(
+    r"^(?P<indent> *)```(?P<language>\w*)[^\n]*\n(?P<body>.*?)^(?P=indent)```", re.MULTILINE | re.DOTALL
+)
+LINK = re.compile(r"\[[^\]]*\]\(<?([^)\s>]+)>?(?:\s+\"[^\"]*\")?\)|^\[[^\]]+\]:\s*(\S+)", re.MULTILINE)
+
+
+class Block(NamedTuple):
+    """One fenced block of a document."""
+
+    language: str
+    body: str
+    line: int
+
+
+def documents(root: Path) -> list[Path]:
+    folders = (root, root / "docs", root / "schemas", root / "benchmarks", root / "clients", root / "docker")
+    return sorted(path for folder in folders for path in folder.glob("*.md"))
+
+
+def blocks(text: str, language: str) -> Iterator[Block]:
+    for match in FENCE.finditer(text):
+        if match["language"] == language:
+            body = re.sub(rf"^{match['indent']}", "", match["body"], flags=re.MULTILINE)
+            yield Block(language, body, text.count("\n", 0, match.start()) + 1)
+
+
+def commands(block: Block) -> Iterator[list[str]]:
+    """The commands after each `$ `, split at pipes, without settings and .venv/bin/."""
+    for line in re.sub(r"\\\n\s*(> )?", " ", block.body).splitlines():
+        if not line.startswith("$ "):
+            continue
+        lexer = shlex.shlex(line[2:], posix=True, punctuation_chars="|&;<>")
+        lexer.whitespace_split = True
+        words: list[str] = []
+        for word in [*lexer, ";"]:
+            if re.fullmatch(r"[|&;]+", word):
+                while words and re.match(r"[A-Za-z_]\w*=", words[0]):
+                    words.pop(0)
+                if words:
+                    yield [words[0].removeprefix(".venv/bin/"), *words[1:]]
+                words = []
+            else:
+                words.append(word)
+
+
+def before_redirection(words: list[str]) -> list[str]:
+    return words[: next((i for i, word in enumerate(words) if re.fullmatch(r"[<>&]+", word)), len(words))]
+
+
+def slugs(text: str) -> set[str]:
+    """The anchors that a forge gives to the headings of a document; repeated ones are numbered."""
+    seen: dict[str, int] = {}
+    found = set()
+    for heading in re.findall(r"^#+\s+(.+?)\s*#*$", FENCE.sub("", text), re.MULTILINE):
+        slug = re.sub(r"[^\w\- ]", "", re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", heading).lower()).replace(
+            " ", "-"
+        )
+        found.add(f"{slug}-{seen[slug]}" if slug in seen else slug)
+        seen[slug] = seen.get(slug, 0) + 1
+    return found
+
+
+def test_there_is_a_readme(root: Path) -> None:
+    assert (root / "README.md").read_text().startswith("# potserver")
+
+
+def test_commands_in_the_documents_exist(
+    root: Path, make_targets: set[str], command_faults: Callable[[list[str]], list[str]]
+) -> None:
+    faults = []
+    for path in documents(root):
+        for block in blocks(path.read_text(), "console"):
+            for words in map(before_redirection, commands(block)):
+                where = f"{path.relative_to(root)}:{block.line}"
+                if words[0] == "make":
+                    targets = [word for word in words[1:] if "=" not in word and not word.startswith("-")]
+                    faults += [f"{where}: no target {name}" for name in targets if name not in make_targets]
+                elif words[0] in ("potserver", "potclient"):
+                    faults += [f"{where}: {fault}" for fault in command_faults(words)]
+                elif words[0] == "docker":
+                    files = [after for word, after in itertools.pairwise(words) if word == "-f"]
+                    faults += [f"{where}: no file {name}" for name in files if not (root / name).is_file()]
+    assert not faults, "\n".join(faults)
+
+
+def test_python_in_the_documents_compiles_and_imports_what_exists(root: Path) -> None:
+    faults = []
+    for path in documents(root):
+        for block in blocks(path.read_text(), "python"):
+            where = f"{path.relative_to(root)}:{block.line}"
+            try:
+                tree = ast.parse(block.body)
+            except SyntaxError as error:
+                faults.append(f"{where}: {error}")
+                continue
+            for node in ast.walk(tree):
+                if isinstance(node, ast.ImportFrom) and node.module and node.module.partition(".")[0] in OURS:
+                    module = importlib.import_module(node.module)
+                    missing = [alias.name for alias in node.names if not hasattr(module, alias.name)]
+                    faults += [f"{where}: {node.module} has no {name}" for name in missing]
+    assert not faults, "\n".join(faults)
+
+
+def test_links_in_the_documents_lead_somewhere(root: Path) -> None:
+    faults = []
+    for path in documents(root):
+        text = path.read_text()
+        for match in LINK.finditer(FENCE.sub("", text)):
+            target = match[1] or match[2]
+            if re.match(r"[a-z][a-z0-9+.-]*:", target):
+                continue  # another site: not ours to check
+            name, _, anchor = target.partition("#")
+            file = (path.parent / name).resolve() if name else path
+            if not file.exists():
+                faults.append(f"{path.relative_to(root)}: no {target}")
+            elif anchor and file.suffix == ".md" and anchor not in slugs(file.read_text()):
+                faults.append(f"{path.relative_to(root)}: no heading {target}")
+    assert not faults, "\n".join(faults)
+
+
+@pytest.mark.parametrize(
+    ("line", "expected"),
+    [
+        ("$ make test", [["make", "test"]]),
+        ("$ POT=1 .venv/bin/potserver serve -l tcp/x:1 &", [["potserver", "serve", "-l", "tcp/x:1"]]),
+        ("$ potclient info | head -3", [["potclient", "info"], ["head", "-3"]]),
+        ("$ cd a && potclient \\\n    watch", [["cd", "a"], ["potclient", "watch"]]),
+        ("its output", []),
+    ],
+)
+def test_commands_are_found(line: str, expected: list[list[str]]) -> None:
+    assert list(commands(Block("console", line, 1))) == expected
