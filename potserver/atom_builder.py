@@ -27,8 +27,8 @@ _INDOOR = LearningSettings(coarse_m=1.0, fine_m=0.4, max_range_m=10.0)
 _BUILTIN = (
     (bundled.STREET, _OUTDOOR, slice(None), "MIT, small_gicp, Kenji Koide", 10),
     (bundled.ROOMS, _INDOOR, slice(None), "MIT, la3dm, Robust Field Autonomy Lab", 8),
-    (bundled.STREET_FLOOR, _OUTDOOR, slice(None), "MIT, small_gicp, Kenji Koide", 6),
-    (bundled.FLOOR, _INDOOR, slice(None), "MIT, la3dm, Robust Field Autonomy Lab", 8),
+    (bundled.STREET_PLAN, _OUTDOOR, slice(None), "MIT, small_gicp, Kenji Koide", 6),
+    (bundled.PLAN, _INDOOR, slice(None), "MIT, la3dm, Robust Field Autonomy Lab", 8),
 )
 
 
@@ -37,13 +37,35 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("datasets", nargs="*", metavar="DATASET", help="recordings to learn from")
     parser.add_argument("-o", "--out", required=True, metavar="FILE", help="dictionary file to write")
     parser.add_argument("--builtin", action="store_true", help="learn the dictionary that the package ships")
-    parser.add_argument("--atoms", type=int, default=12, metavar="N", help="atoms kept of each recording [12]")
-    parser.add_argument("--scans", type=int, default=10, metavar="N", help="first scans taken of each recording [10]")
-    parser.add_argument("--sectors", type=int, default=_OUTDOOR.n_sectors, metavar="N", help=f"a scan [{_OUTDOOR.n_sectors}]")
-    parser.add_argument("--max-range", type=float, default=_OUTDOOR.max_range_m, metavar="M", help=f"[{_OUTDOOR.max_range_m}]")
-    parser.add_argument("--coarse", type=float, default=_OUTDOOR.coarse_m, metavar="M", help=f"kernel spacing [{_OUTDOOR.coarse_m}]")
-    parser.add_argument("--fine", type=float, default=_OUTDOOR.fine_m, metavar="M", help=f"the same at hits [{_OUTDOOR.fine_m}]")
-    parser.add_argument("--licence", default="not stated", help="licence of the recordings, kept with the atoms")
+    parser.add_argument(
+        "--atoms", type=int, default=12, metavar="N", help="atoms kept of each recording [12]"
+    )
+    parser.add_argument(
+        "--scans", type=int, default=10, metavar="N", help="first scans taken of each recording [10]"
+    )
+    parser.add_argument(
+        "--sectors", type=int, default=_OUTDOOR.n_sectors, metavar="N", help=f"a scan [{_OUTDOOR.n_sectors}]"
+    )
+    parser.add_argument(
+        "--max-range", type=float, default=_OUTDOOR.max_range_m, metavar="M", help=f"[{_OUTDOOR.max_range_m}]"
+    )
+    parser.add_argument(
+        "--coarse",
+        type=float,
+        default=_OUTDOOR.coarse_m,
+        metavar="M",
+        help=f"kernel spacing [{_OUTDOOR.coarse_m}]",
+    )
+    parser.add_argument(
+        "--fine",
+        type=float,
+        default=_OUTDOOR.fine_m,
+        metavar="M",
+        help=f"the same at hits [{_OUTDOOR.fine_m}]",
+    )
+    parser.add_argument(
+        "--licence", default="not stated", help="licence of the recordings, kept with the atoms"
+    )
 
 
 def run(options: argparse.Namespace) -> AtomDictionary:
@@ -62,7 +84,10 @@ def run(options: argparse.Namespace) -> AtomDictionary:
                 atoms += _learn_recording(recording, name, settings, licence, keep)
         else:
             settings = LearningSettings(
-                n_sectors=options.sectors, max_range_m=options.max_range, coarse_m=options.coarse, fine_m=options.fine
+                n_sectors=options.sectors,
+                max_range_m=options.max_range,
+                coarse_m=options.coarse,
+                fine_m=options.fine,
             )
             for path in options.datasets:
                 recording = open_dataset(path)[: options.scans]
@@ -75,7 +100,9 @@ def run(options: argparse.Namespace) -> AtomDictionary:
     return dictionary
 
 
-def _learn_recording(recording: Recording, name: str, settings: LearningSettings, licence: str, keep: int) -> list[Atom]:
+def _learn_recording(
+    recording: Recording, name: str, settings: LearningSettings, licence: str, keep: int
+) -> list[Atom]:
     # beams held out as everywhere in the project: what the demo is judged on was never learned
     hold_out = HoldOut()
     candidates: list[Atom] = []
@@ -85,7 +112,9 @@ def _learn_recording(recording: Recording, name: str, settings: LearningSettings
             {"source": name, "scan": scan.name, "licence": licence}, seed=number,
         )  # fmt: skip
         candidates += [_scored(atom, scan, held_out) for atom in learned]
-        logging.getLogger(__name__).info("%s: scan %d of %d, %d atoms", name, number + 1, len(recording), len(learned))
+        logging.getLogger(__name__).info(
+            "%s: scan %d of %d, %d atoms", name, number + 1, len(recording), len(learned)
+        )
     return list(choose_diverse(candidates, keep))
 
 
@@ -100,7 +129,11 @@ def _scored(atom: Atom, scan: RecordedScan, held_out: LabelledPoints) -> Atom:
         return atom
     answer = KernelMap(atom.kernels).occupancy(local[inside])
     scores = score(answer.mean, occupied, answer.observed)
-    noted = {"held_out_auc": f"{scores.auc:.4f}", "held_out_nll": f"{scores.nll:.4f}", "held_out_n": str(scores.n)}
+    noted = {
+        "held_out_auc": f"{scores.auc:.4f}",
+        "held_out_nll": f"{scores.nll:.4f}",
+        "held_out_n": str(scores.n),
+    }
     return dataclasses.replace(atom, provenance=atom.provenance | noted)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from importlib import resources
 from pathlib import Path
 
@@ -10,8 +11,8 @@ from potclient.datasets.planar import PlanarSlice
 
 STREET = "street"  # two outdoor LiDAR scans, 0.5 m apart
 ROOMS = "rooms"  # twelve scans of a simulated indoor scene: four places, three headings
-FLOOR = "floor"  # the rooms as a planar scanner sees them
-STREET_FLOOR = "street-floor"  # the street as a planar scanner sees it
+PLAN = "plan"  # the rooms in 2D: beams that clear the floor, seen from above
+STREET_PLAN = "street-plan"  # the street in 2D: its nearly horizontal beams
 
 _ROOMS_MAX_RANGE_M = 8.0  # longer readings of that simulated sensor are beams without an echo
 
@@ -21,8 +22,8 @@ def open_bundled(name: str) -> Recording:
     return {
         STREET: _street,
         ROOMS: _rooms,
-        FLOOR: lambda: PlanarSlice(_rooms()),
-        STREET_FLOOR: lambda: PlanarSlice(_street()),
+        PLAN: lambda: PlanarSlice(_rooms(), (math.radians(2.0), math.radians(15.0))),
+        STREET_PLAN: lambda: PlanarSlice(_street(), (math.radians(-1.5), math.radians(1.5))),
     }[name]()
 
 

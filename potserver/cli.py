@@ -15,6 +15,8 @@ from collections.abc import Iterator, Sequence
 from types import FrameType
 from typing import Any, TextIO
 
+import zenoh
+
 from potschemas import __version__
 from potserver.adapters.log import configure_logging, get_logger
 from potserver.config import Settings, as_tree, load_settings, to_toml
@@ -85,6 +87,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _serve(options: argparse.Namespace) -> int:
     settings = _settings(options)
     configure_logging(settings.log.level, settings.log.format)
+    zenoh.try_init_log_from_env()  # RUST_LOG
     from potserver.server import MapServer  # after the flags are known to be good: this loads the numerics
 
     with _StopSignals.installed() as stop:

@@ -38,8 +38,9 @@ from potserver.services.settings import PROFILES, MappingSettings
 _BUNDLED = {
     bundled.STREET: "a street, two real outdoor scans, 3D",
     bundled.ROOMS: "rooms, twelve simulated scans, 3D",
-    bundled.FLOOR: "the same rooms as a planar scanner sees them, 2D",
+    bundled.PLAN: "the same rooms in 2D, seen from above",
 }
+_PICTURE_ABOVE_SENSOR_M = {bundled.ROOMS: 0.6}  # that sensor stands on the floor
 _PICTURE_CELLS = 400  # along the longer side
 _SPEED_POINTS = 200_000
 
@@ -90,13 +91,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
         server.start()
     console.print(f"server ready after {time.perf_counter() - started:.1f} s at {server.endpoint}\n")
     try:
-        results = [_run_map(server.endpoint, name, recording, out, console) for name, recording in recordings.items()]
+        results = [
+            _run_map(server.endpoint, name, recording, out, console) for name, recording in recordings.items()
+        ]
     finally:
         server.stop()
     summary = _summary(results, options.profile, time.perf_counter() - started)
     (out / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
     _print_totals(summary, console)
-    console.print(f"\nresults: {out}/summary.json; pictures: {', '.join(f'{out}/{r.name}.png' for r in results)}")
+    console.print(
+        f"\nresults: {out}/summary.json; pictures: {', '.join(f'{out}/{r.name}.png' for r in results)}"
+    )
     return 0 if summary["receipts_accepted"] == summary["scans"] else 1
 
 
@@ -107,8 +112,12 @@ def _parser() -> argparse.ArgumentParser:
         epilog="examples:\n  potserver demo\n  potserver demo --profile paper\n  potserver demo /data/kitti/00 --scans 20",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("datasets", nargs="*", metavar="DATASET", help="recordings to map in place of the bundled ones")
-    parser.add_argument("--profile", choices=sorted(PROFILES), default="default", help="mapping profile [default]")
+    parser.add_argument(
+        "datasets", nargs="*", metavar="DATASET", help="recordings to map in place of the bundled ones"
+    )
+    parser.add_argument(
+        "--profile", choices=sorted(PROFILES), default="default", help="mapping profile [default]"
+    )
     parser.add_argument("--scans", type=int, metavar="N", help="at most this many scans of each recording")
     parser.add_argument("--out", default="out/demo", metavar="FOLDER", help="where results go [out/demo]")
     return parser
@@ -164,7 +173,9 @@ def _run_map(endpoint: str, name: str, recording: Recording, out: Path, console:
         f"held-out beams: ACC {scores.accuracy:.3f}  AUC {scores.auc:.3f}  NLL {scores.nll:.3f}  ECE {scores.ece:.3f}"
         f"  unknown {scores.share_unknown:.1%}  of {scores.n} points; {queries_per_s:,.0f} point queries/s over Zenoh\n"
     )
-    return _MapResult(name, receipts, labels, answer.mean, answer.observed, scores, info.n_kernels, queries_per_s)
+    return _MapResult(
+        name, receipts, labels, answer.mean, answer.observed, scores, info.n_kernels, queries_per_s
+    )
 
 
 def _sector(sector: SectorReport) -> str:
@@ -193,7 +204,7 @@ def _draw(
     near = hits[np.abs(hits - track.mean(axis=0)).max(axis=1) <= 30.0]
     lower, upper = near.min(axis=0) - 1.0, near.max(axis=0) + 1.0
     cell = float((upper - lower)[:2].max()) / _PICTURE_CELLS
-    level = 0.0 if planar else float(track[:, 2].mean())
+    level = 0.0 if planar else float(track[:, 2].mean()) + _PICTURE_ABOVE_SENSOR_M.get(name, 0.0)
     lower[2], upper[2] = level - cell / 2.0, level + cell / 2.0
     grid = client.grid(lower, upper, cell)
     draw_layer(grid, out / f"{name}.png", hits=hits, path_of_sensor=track, title=name)
@@ -226,7 +237,9 @@ def _summary(results: list[_MapResult], profile: str, elapsed_s: float) -> dict[
                 "ms_per_scan": r.ms_per_scan,
                 "ms_per_scan_median": float(np.median(r.ms_per_scan)),
                 "queries_per_s": r.queries_per_s,
-                "atoms": dict(Counter(s.atom_id for receipt in r.receipts for s in receipt.sectors if s.atom_id)),
+                "atoms": dict(
+                    Counter(s.atom_id for receipt in r.receipts for s in receipt.sectors if s.atom_id)
+                ),
             }
             for r in results
         },
@@ -243,7 +256,18 @@ def _scores(m: Metrics) -> dict[str, float]:
 def _print_totals(summary: dict[str, Any], console: Console) -> None:
     table = Table(box=None, header_style="dim", pad_edge=False)
     table.add_column("map")
-    for column in ("scans", "accepted", "kernels", "ms/scan", "ACC", "AUC", "NLL", "ECE", "unknown", "queries/s"):
+    for column in (
+        "scans",
+        "accepted",
+        "kernels",
+        "ms/scan",
+        "ACC",
+        "AUC",
+        "NLL",
+        "ECE",
+        "unknown",
+        "queries/s",
+    ):
         table.add_column(column, justify="right")
     for name, row in [*summary["maps"].items(), ("all", summary)]:
         table.add_row(

@@ -10,6 +10,7 @@ publisher and its queryable.
 
 from __future__ import annotations
 
+import atexit
 import dataclasses
 import threading
 import time
@@ -106,6 +107,7 @@ class MapServer:
             services = {map_id: self._make_map(map_id) for map_id in s.maps}
             config = build_config(s.zenoh, root=s.root, wire_guard_bytes=s.limits.wire_guard_bytes)
             self._session, self._endpoints = open_session(config)
+            atexit.register(self.stop)  # leaving with Zenoh open would abort the process
             try:
                 started_s = time.perf_counter()
                 next(iter(services.values()))[0].warm_up()  # all maps share the compiled numerics
@@ -148,6 +150,7 @@ class MapServer:
             if self._stopped_clean is None:
                 timeout_s = self.settings.drain_timeout_s if drain_timeout_s is None else drain_timeout_s
                 self._stopped_clean = self._teardown(timeout_s)
+                atexit.unregister(self.stop)
             return self._stopped_clean
 
     def __enter__(self) -> MapServer:

@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from potclient.loadtest import LoadReport
     from potclient.metrics import Metrics
     from potclient.play import PlayReport, ScanOutcome
-    from potclient.results import Grid
 
 EXIT_OK, EXIT_FAILED, EXIT_USAGE, EXIT_INTERRUPTED = 0, 1, 2, 130
 
@@ -222,7 +221,10 @@ def _scan_progress(total: int, *, quiet: bool) -> Iterator[Callable[[ScanOutcome
     with bar:
 
         def show(outcome: ScanOutcome) -> None:
-            bar.console.print(line(outcome), highlight=False, markup=False)
+            if sys.stdout.isatty():
+                bar.console.print(line(outcome), highlight=False, markup=False, soft_wrap=True)
+            else:
+                _say(line(outcome))
             bar.advance(task)
 
         yield show
@@ -389,7 +391,9 @@ def _grid(arguments: argparse.Namespace) -> int:
         grid.save(arguments.out)
         _say(f"wrote {arguments.out}")
     if arguments.png is not None:
-        _draw(grid, arguments.png, arguments.level)
+        from potclient.pictures import draw_layer
+
+        draw_layer(grid, arguments.png, level_m=arguments.level)
         _say(f"wrote {arguments.png}")
     return EXIT_OK
 
@@ -403,36 +407,6 @@ def _part_progress() -> Callable[[int, int], None] | None:
         sys.stderr.flush()
 
     return show
-
-
-def _draw(grid: Grid, path: Path, level_m: float | None) -> None:
-    try:
-        import matplotlib
-    except ImportError as error:
-        raise UsageError("--png needs the package matplotlib: pip install matplotlib") from error
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-
-    nx, ny, nz = grid.shape
-    z_low = float(grid.lower[2])
-    layer = nz // 2 if level_m is None else math.floor((level_m - z_low) / grid.resolution)
-    if not 0 <= layer < nz:
-        raise UsageError(
-            f"--level {level_m} m is outside the grid, {z_low:g} to {z_low + nz * grid.resolution:g} m"
-        )
-    x, y = float(grid.lower[0]), float(grid.lower[1])
-    extent = (x, x + nx * grid.resolution, y, y + ny * grid.resolution)
-    figure, axes = pyplot.subplots(1, 2, figsize=(12, 5), layout="constrained")
-    for axis, values, title, colours, top in (
-        (axes[0], grid.mean[:, :, layer], "P(occupied)", "coolwarm", 1.0),
-        (axes[1], np.sqrt(grid.var[:, :, layer]), "standard deviation", "viridis", 0.5),
-    ):
-        image = axis.imshow(values.T, origin="lower", extent=extent, cmap=colours, vmin=0.0, vmax=top)
-        figure.colorbar(image, ax=axis, shrink=0.8)
-        axis.set(title=title, xlabel="x [m]", ylabel="y [m]")
-    figure.suptitle(f"z = {z_low + (layer + 0.5) * grid.resolution:.2f} m, revision {grid.revision}")
-    figure.savefig(path, dpi=120)
-    pyplot.close(figure)
 
 
 # --- watch ---------------------------------------------------------------------------------------------------------
@@ -524,7 +498,7 @@ exit status is 1 if a cloud has no known fate, or a question failed for another 
     parser.add_argument("--query-points", type=int, default=1000, help="points a question (default 1000)")
     parser.add_argument("--dataset", default="generated", help="recording to send (default: generated)")
     parser.add_argument(
-        "--receipt-timeout", type=_positive, default=10.0, metavar="SECONDS", help="default 10"
+        "--receipt-timeout", type=_positive, default=30.0, metavar="SECONDS", help="default 30"
     )
     parser.add_argument(
         "--robot-prefix", default="load", help="robots are PREFIX-0, PREFIX-1, ... (default load)"
@@ -764,14 +738,18 @@ def _open_recording(arguments: argparse.Namespace) -> Recording:
     return chosen
 
 
-def _client(arguments: argparse.Namespace, **settings: Any) -> MapClient:
-    return MapClient(
+@contextlib.contextmanager
+def _client(arguments: argparse.Namespace, **settings: Any) -> Iterator[MapClient]:
+    with MapClient(
         map=arguments.map,
         root=arguments.root,
         timeout_s=arguments.timeout,
         options=options_from_arguments(arguments),
         **settings,
-    )
+    ) as client:
+        if arguments.wait > 0:
+            client.wait_ready(arguments.wait)
+        yield client
 
 
 def _positive(text: str) -> float:

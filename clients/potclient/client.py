@@ -370,12 +370,16 @@ class MapClient:
                 self._declare_robot(robot)
         self._zenoh_call(publisher.put, encode(message))
 
-    def flush(self, timeout_s: float | None = None) -> bool:
-        """Wait until every published cloud has its outcome; false if `timeout_s` (None: no limit) ran out first."""
+    def flush(self, timeout_s: float | None = None, *, late: bool = False) -> bool:
+        """Wait until every published cloud has its outcome; false if `timeout_s` (None: no limit) ran out first.
+
+        Args:
+            late: Wait also for receipts that are late already; a receipt that is lost never comes, so give a limit.
+        """
         until = None if timeout_s is None else time.monotonic() + timeout_s
         done = True
         for feed in list(self._feeds.values()):
-            done &= feed.flush(None if until is None else max(0.0, until - time.monotonic()))
+            done &= feed.flush(None if until is None else max(0.0, until - time.monotonic()), late=late)
         return done
 
     def receipts(self, robot: str = "r1", timeout_s: float | None = None) -> Iterator[Receipt]:

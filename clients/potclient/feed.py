@@ -2,7 +2,8 @@
 
 Zenoh's put never fails and never tells: a cloud to a dead server, a denied key or a full queue is simply gone. And kernel
 socket buffers hold some 8 MB of stale clouds, so that a map fed without limits lags behind by half a second. Hence receipts: at
-most `credit` clouds are on their way, the newest one waits in a slot, and what it replaces is dropped here and counted.
+most `credit` clouds are on their way, the newest one waits in a slot, and what it replaces is dropped here and counted. After
+a cloud that the server had to drop the feed pauses, longer each time, up to a second.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from potschemas import messages
 from potschemas.messages import ReceiptStatus
 
 _MATCH_POLL_S = 0.02  # only while a cloud waits and no server listens
+_BACKOFF_S = (0.05, 1.0)  # after a cloud that the server dropped: first, longest
 _MAX_EXPIRED = 4096  # clouds whose receipt may still come late
 _MAX_RECEIPTS = 4096  # receipts kept for the iterator
 
@@ -85,6 +87,8 @@ class Feed:
         self._offered = self._sent = self._dropped_by_client = self._unknown = 0
         self._outcomes = dict.fromkeys(ReceiptStatus, 0)
         self.stray_receipts = 0  # for clouds that this feed did not send: another process uses the robot's id
+        self._backoff_s = 0.0
+        self._not_before = float("-inf")
         self._closing = False
         self._thread = threading.Thread(target=self._run, name=f"potclient-feed-{robot}", daemon=True)
         self._thread.start()
@@ -142,10 +146,12 @@ class Feed:
                     raise ClosedError("the client was closed before this cloud was sent")
             return seq
 
-    def flush(self, timeout_s: float | None = None) -> bool:
-        """Wait until every cloud has its outcome; false if the time ran out."""
+    def flush(self, timeout_s: float | None = None, *, late: bool = False) -> bool:
+        """Wait until every cloud has its outcome, with `late` another one than unknown; false if the time ran out."""
         with self._changed:
-            return self._changed.wait_for(self._is_idle, timeout_s)
+            return self._changed.wait_for(
+                lambda: self._is_idle() and (self._closing or not late or not self._expired), timeout_s
+            )
 
     def receipts(self, timeout_s: float | None = None) -> Iterator[Receipt]:
         """Receipts as they come; ends when every cloud has its outcome.
@@ -207,7 +213,16 @@ class Feed:
                     self.stray_receipts += 1
                     return None
                 self._unknown -= 1
-            receipt = Receipt(message, round_trip_s=self._clock() - sent.started)
+            now = self._clock()
+            receipt = Receipt(message, round_trip_s=now - sent.started)
+            if (
+                message.status is ReceiptStatus.DROPPED
+            ):  # an overloaded server answers at once: do not flood it
+                first_s, longest_s = _BACKOFF_S
+                self._backoff_s = min(max(first_s, 2.0 * self._backoff_s), longest_s)
+                self._not_before = now + self._backoff_s
+            else:
+                self._backoff_s = 0.0
             self._outcomes[message.status] += 1
             self._receipts.append(receipt)
             self._changed.notify_all()
@@ -244,7 +259,7 @@ class Feed:
             while not self._closing:
                 now = self._clock()
                 self._expire(now)
-                has_credit = len(self._in_flight) < self._credit
+                has_credit = len(self._in_flight) < self._credit and now >= self._not_before
                 if self._slot is not None and has_credit and self._is_matched():
                     cloud, self._slot = self._slot, None
                     self._in_flight[cloud.seq] = _Sent(now)
@@ -254,6 +269,8 @@ class Feed:
                 deadlines = [s.deadline - now for s in self._in_flight.values() if s.deadline is not None]
                 if self._slot is not None and has_credit:
                     deadlines.append(_MATCH_POLL_S)
+                elif self._slot is not None and now < self._not_before:
+                    deadlines.append(self._not_before - now)
                 self._changed.wait(min(deadlines) if deadlines else None)
             return None
 

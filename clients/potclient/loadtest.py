@@ -32,8 +32,8 @@ class LoadSettings:
     duration_s: float = 10.0
     n_points: int = 5_000  # a cloud
     query_points: int = 1_000  # a question
-    receipt_timeout_s: float = 10.0
-    query_timeout_s: float = 5.0
+    receipt_timeout_s: float = 30.0
+    query_timeout_s: float = 10.0
     robot_prefix: str = "load"
     seed: int = 0
 
@@ -233,6 +233,7 @@ def _robot(
                 k += 1
                 beat += 1.0 / settings.rate_hz
             client.flush(2 * settings.receipt_timeout_s + 6.0)  # both credits may run out one after the other
+            client.flush(settings.receipt_timeout_s, late=True)
     except PotclientError as error:
         tally.fail(error)
     finally:

@@ -93,7 +93,7 @@ def draw_layer(
         figure.colorbar(image, ax=axis, shrink=0.8)
     axes[0].set_ylabel("y [m]")
     if hits is not None or path_of_sensor is not None:
-        axes[0].legend(loc="upper right", fontsize="x-small", markerscale=4)
+        axes[0].legend(loc="upper right", fontsize="x-small")
     head = f"{title}, " if title else ""
     figure.suptitle(
         f"{head}z = {z_low + (layer + 0.5) * cell:.2f} m, revision {grid.revision}, grey = unknown"

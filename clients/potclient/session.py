@@ -164,7 +164,7 @@ def add_zenoh_arguments(parser: argparse.ArgumentParser) -> None:
         type=float,
         default=0.0,
         metavar="SECONDS",
-        help="wait this long for the server to come up (default 0)",
+        help="wait this long for the server to come up and be ready (default 0)",
     )
 
 

@@ -144,6 +144,7 @@ def decode_cloud_head(payload: bytes) -> CloudHead:
     return CloudHead(head.seq, head.robot)
 
 
+@np.errstate(over="ignore", invalid="ignore")  # hostile numbers may overflow on the way to their error
 def decode_cloud(
     payload: bytes,
     *,
@@ -212,6 +213,7 @@ def decode_cloud(
     )
 
 
+@np.errstate(over="ignore", invalid="ignore")
 def decode_pose(payload: bytes, *, max_bytes: int = 4096) -> tuple[int, Float64]:
     """Stamp and (4, 4) matrix of one pose of a pose stream.
 
@@ -355,11 +357,11 @@ def accepted_receipt(
             queue_depth=queue_depth,
             wait_ms=wait_ms,
             integrate_ms=integrate_ms,
-            map_revision=update.map_revision,
-            n_points=update.n_points,
+            map_revision=int(update.map_revision),
+            n_points=int(update.n_points),
             n_kernels=len(update.kernels),
-            n_kernels_added=update.n_kernels_added,
-            map_kernels=update.map_kernels,
+            n_kernels_added=int(update.n_kernels_added),
+            map_kernels=int(update.map_kernels),
             sectors=_sectors(update.sectors),
             kernels=kernels,
         )
@@ -409,7 +411,7 @@ def encode_params(
             robot=scan.robot_id,
             seq=scan.seq,
             stamp_ns=scan.stamp_ns,
-            map_revision=update.map_revision,
+            map_revision=int(update.map_revision),
             kernels=encode_kernels(
                 update.kernels, observed_activation=observed_activation, prior_var=prior_var
             ),
@@ -423,9 +425,9 @@ def encode_revision(*, map_id: str, update: MapUpdate, stamp_ns: int) -> Wire:
     return _wire(
         messages.Revision(
             map=map_id,
-            map_revision=update.map_revision,
+            map_revision=int(update.map_revision),
             stamp_ns=stamp_ns,
-            n_kernels=update.map_kernels,
+            n_kernels=int(update.map_kernels),
             tile_size_m=float(update.changed.tile_size_m),
             changed_tiles=[[int(i) for i in tile] for tile in update.changed.tiles],
         )

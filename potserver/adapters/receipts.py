@@ -9,7 +9,9 @@ transfer; when the bulk outbox is full, parameters are dropped and counted (`par
 from __future__ import annotations
 
 import contextlib
+import math
 import time
+from collections.abc import Callable
 
 import zenoh
 
@@ -43,6 +45,7 @@ class ReceiptSender:
         self._session, self._keys = session, keys
         self._mapper, self._intake, self._health = mapper, intake, health
         self._prompt, self._bulk = prompt, bulk
+        self._reported_s: dict[str, float] = {}
 
     def accept(
         self, job: CloudJob, scan: Scan, update: MapUpdate, *, wait_ms: float, integrate_ms: float
@@ -119,8 +122,7 @@ class ReceiptSender:
                 return
             head = codec.decode_cloud_head(job.payload.to_bytes())
             robot_id = job.robot_id or ""
-            report = log.debug if error.retryable else log.info  # under load there are very many
-            report(
+            self._report(error)(
                 "scan_refused",
                 map_id=self._keys.map_id,
                 robot_id=robot_id,
@@ -148,6 +150,14 @@ class ReceiptSender:
             self._prompt.post(send, job.n_bytes)
         else:
             self._prompt.post_now(send, job.n_bytes)
+
+    def _report(self, error: PotserverError) -> Callable[..., None]:
+        """One line a second and reason; the counters have them all."""
+        now_s = time.monotonic()
+        if now_s - self._reported_s.get(error.code, -math.inf) < 1.0:
+            return log.debug
+        self._reported_s[error.code] = now_s
+        return log.info
 
     def _put(self, key: str, wire: codec.Wire, priority: zenoh.Priority) -> None:
         self._session.put(

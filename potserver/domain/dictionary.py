@@ -67,7 +67,10 @@ class AtomDictionary:
         arrays: dict[str, np.ndarray] = {}
         header = {"format": FORMAT, "version": FORMAT_VERSION, "atoms": []}
         for i, atom in enumerate(self.atoms):
-            entry = {k: getattr(atom, k) for k in ("atom_id", "dims", "radius_m", "azimuth_width_rad", "provenance")}
+            entry = {
+                k: getattr(atom, k)
+                for k in ("atom_id", "dims", "radius_m", "azimuth_width_rad", "provenance")
+            }
             header["atoms"].append(entry)  # type: ignore[attr-defined]
             arrays |= {f"{i}.{name}": getattr(atom, name) for name in _POINT_SETS}
             arrays |= {f"{i}.{name}": getattr(atom.kernels, name) for name in _KERNEL_ARRAYS}
@@ -79,7 +82,12 @@ class AtomDictionary:
                 buffer = io.BytesIO()
                 np.lib.format.write_array(buffer, np.ascontiguousarray(arrays[name]), allow_pickle=False)
                 # a fixed date: the file depends on the atoms alone
-                archive.writestr(zipfile.ZipInfo(f"{name}.npy", (1980, 1, 1, 0, 0, 0)), buffer.getvalue(), zipfile.ZIP_DEFLATED, 9)
+                archive.writestr(
+                    zipfile.ZipInfo(f"{name}.npy", (1980, 1, 1, 0, 0, 0)),
+                    buffer.getvalue(),
+                    zipfile.ZIP_DEFLATED,
+                    9,
+                )
         partial.replace(target)
 
     @staticmethod

@@ -26,6 +26,7 @@ class KernelMap:
         *,
         observed_activation: float = OBSERVED_ACTIVATION,
         prior_var: float = PRIOR_VAR,
+        residual_var: float = 0.0,
         map_revision: int = 0,
         threads: int | None = None,
         tau: float | None = None,
@@ -36,6 +37,9 @@ class KernelMap:
             kernels: In the map frame; gamma enters by its mean.
             observed_activation: Points with a smaller activation sum answer 0.5, `prior_var`, and `observed` false.
             prior_var: Latent variance of unobserved points, log-odds^2.
+            residual_var: What the kernels cannot know, log-odds^2: it is added to the latent variance in the measure that the
+                activation falls short of 1, so that certainty fades with the kernels. 0 is the paper's model, which is *surer*
+                the farther it is from all data.
             map_revision: Carried into the answers.
             threads: Threads a query may use; all processors by default.
             tau: Support cut, if it was measured on a similar map before; see `numerics.kernel_index`.
@@ -43,6 +47,7 @@ class KernelMap:
         self.kernels = kernels
         self.observed_activation = observed_activation
         self.prior_var = prior_var
+        self.residual_var = residual_var
         self.map_revision = map_revision
         self._threads = threads or default_threads()
         self._index = kernel_index.build_index(
@@ -79,7 +84,9 @@ class KernelMap:
         hinge = as_points(hinge_points)
         g, w, v = (np.asarray(a, np.float64).reshape(-1) for a in (gamma, weight_mean, weight_var))
         if not len(hinge) == len(g) == len(w) == len(v):
-            raise ShapeError(f"{len(hinge)} hinge points, {len(g)} gammas, {len(w)} means, {len(v)} variances: K differs")
+            raise ShapeError(
+                f"{len(hinge)} hinge points, {len(g)} gammas, {len(w)} means, {len(v)} variances: K differs"
+            )
         if not (np.isfinite(w).all() and np.isfinite(v).all() and np.isfinite(g).all()):
             raise ShapeError("gamma, weight_mean and weight_var must be finite")
         if (g <= 0).any() or (v < 0).any():
@@ -112,12 +119,16 @@ class KernelMap:
         Raises:
             ShapeError: not (N, 3) or (N, 2).
             BadPointsError: NaN or infinite coordinates.
-        Source: paper eq. 1; the moderated sigmoid of MacKay 1992.
+        Source: paper eq. 1; the moderated sigmoid of MacKay 1992; the residual variance is the diagonal correction of sparse
+            Gaussian processes (Snelson and Ghahramani 2006), in the kernels' own measure.
         """
         sums = self.latent(as_points(points))
         observed = sums.activation >= self.observed_activation
         latent_mean = np.where(observed, sums.mean, np.float32(0))
-        latent_var = np.where(observed, sums.var, np.float32(self.prior_var))
+        unexplained = np.maximum(np.float32(1) - sums.activation, np.float32(0))
+        latent_var = np.where(
+            observed, sums.var + np.float32(self.residual_var) * unexplained, np.float32(self.prior_var)
+        )
         # float64: in float32 a sure answer would round to exactly 1 and cost an infinite log-loss when wrong
         mean, var = predict_occupancy(latent_mean.astype(np.float64), latent_var.astype(np.float64))
         return Occupancy(
@@ -149,4 +160,3 @@ def as_points(points: ArrayLike) -> Float64:
     if array.shape[1] == 2:
         array = np.concatenate([array, np.zeros((len(array), 1))], axis=1)
     return np.ascontiguousarray(array)
-

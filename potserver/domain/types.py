@@ -66,7 +66,9 @@ def check_rigid(transform: Float64, tolerance: float = 1e-3) -> None:
     rotation = transform[:3, :3]
     defect = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
     if defect > tolerance or np.linalg.det(rotation) < 0:
-        raise BadPoseError(f"the pose is not rigid: R R^T is off by {defect:.2g}, det {np.linalg.det(rotation):.3f}")
+        raise BadPoseError(
+            f"the pose is not rigid: R R^T is off by {defect:.2g}, det {np.linalg.det(rotation):.3f}"
+        )
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -115,7 +117,10 @@ class KernelSet:
         if not sets:
             return KernelSet.empty()
         return KernelSet(
-            **{f.name: np.concatenate([getattr(s, f.name) for s in sets]) for f in dataclasses.fields(KernelSet)}
+            **{
+                f.name: np.concatenate([getattr(s, f.name) for s in sets])
+                for f in dataclasses.fields(KernelSet)
+            }
         )
 
     @staticmethod

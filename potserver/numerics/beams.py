@@ -36,7 +36,9 @@ def limit_range(beams: Beams, min_range_m: float, max_range_m: float) -> Beams:
     return Beams(ends * scale[:, None], is_return & ~too_long)
 
 
-def label_beams(beams: Beams, *, free_per_beam: int, gap_m: float, rng: np.random.Generator) -> LabelledPoints:
+def label_beams(
+    beams: Beams, *, free_per_beam: int, gap_m: float, rng: np.random.Generator
+) -> LabelledPoints:
     """Hits at the ends of returned beams; free points along every beam.
 
     Args:
@@ -52,7 +54,9 @@ def label_beams(beams: Beams, *, free_per_beam: int, gap_m: float, rng: np.rando
     length = np.linalg.norm(beams.ends, axis=1)
     usable = np.where(beams.is_return, length - gap_m, length)
     long_enough = np.flatnonzero(usable > 0)
-    fraction = (np.arange(free_per_beam) + rng.random((len(long_enough), free_per_beam))) / max(free_per_beam, 1)
+    fraction = (np.arange(free_per_beam) + rng.random((len(long_enough), free_per_beam))) / max(
+        free_per_beam, 1
+    )
     fraction *= (usable[long_enough] / length[long_enough])[:, None]
     free = (beams.ends[long_enough, None, :] * fraction[..., None]).reshape(-1, 3)
     assert len(hit) <= n

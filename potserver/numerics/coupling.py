@@ -116,7 +116,9 @@ def coupling_costs(
     pairs = np.ascontiguousarray(pairs, np.int64)
     if pairs.ndim != 2 or pairs.shape[1] != 2:
         raise ShapeError(f"pairs: {pairs.shape}, need (P, 2)")
-    if len(pairs) and (pairs.min() < 0 or pairs[:, 0].max() >= len(sources) or pairs[:, 1].max() >= len(targets)):
+    if len(pairs) and (
+        pairs.min() < 0 or pairs[:, 0].max() >= len(sources) or pairs[:, 1].max() >= len(targets)
+    ):
         raise ShapeError(f"pairs names a set beyond {len(sources)} sources or {len(targets)} targets")
     n = len(pairs)
     cost, error = np.empty(n, np.float32), np.empty(n, np.float32)
@@ -130,6 +132,8 @@ def coupling_costs(
 
     stride = max(1, min(n, 8 * threads))
     parallel_map(run, range(stride if n else 0), threads)
+    # asked here once more: compiled with fast-math, the solver itself may take a NaN for a number
+    converged &= np.isfinite(cost) & np.isfinite(error)
     return CouplingCosts(cost, error, iterations, converged)
 
 
@@ -164,11 +168,13 @@ def couple(
     eps, cost, error, iterations, converged = _sinkhorn(
         x, y, np.float32(reg), relative, np.float32(tolerance), max_iterations, kernel, f, g, u, v, t
     )
-    kernel *= u[:, None] / np.float32(len(x))
-    kernel *= v[None, :] / np.float32(len(y))
-    with np.errstate(divide="ignore"):
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):  # of a solve that failed
+        kernel *= u[:, None] / np.float32(len(x))
+        kernel *= v[None, :] / np.float32(len(y))
         f += eps * np.log(u)
         g += eps * np.log(v)
+    # asked here once more: compiled with fast-math, the solver itself may take a NaN for a number
+    converged = converged and all(bool(np.isfinite(a).all()) for a in (cost, error, f, g, kernel))
     return Coupling(kernel, float(cost), f, g, float(eps), float(error), int(iterations), bool(converged))
 
 
@@ -178,7 +184,9 @@ def _check_reg(reg: float) -> None:
 
 
 @nb.njit(nogil=True, fastmath=FAST, error_model="numpy", cache=True)
-def _solve_pairs(xs, x_offsets, ys, y_offsets, pairs, start, stride, reg, relative, tol, max_iter, cost, error, its, ok):  # type: ignore[no-untyped-def]
+def _solve_pairs(
+    xs, x_offsets, ys, y_offsets, pairs, start, stride, reg, relative, tol, max_iter, cost, error, its, ok
+):  # type: ignore[no-untyped-def]
     n_max = 0
     m_max = 0
     for p in range(start, len(pairs), stride):
@@ -294,7 +302,7 @@ def _sinkhorn(x, y, reg, relative, tol, max_iter, kernel, f, g, u, v, t):  # typ
     if eps <= np.float32(0):  # one point, or all on one spot: every plan costs the same
         eps = np.float32(1)
     level = eps
-    while level < np.float32(0.02) * largest:
+    while level < np.float32(0.02) * largest < np.float32(np.inf):
         level *= np.float32(2)
     u[:] = np.float32(1)
     v[:] = np.float32(1)
@@ -304,7 +312,7 @@ def _sinkhorn(x, y, reg, relative, tol, max_iter, kernel, f, g, u, v, t):  # typ
         final = level <= eps * np.float32(1.001)
         _gibbs(x, y, f, g, np.float32(1) / level, kernel)
         if not final:
-            for _ in range(_SWEEPS_PER_LEVEL):
+            for _ in range(min(_SWEEPS_PER_LEVEL, max_iter - its)):
                 _, extreme = _iterate(kernel, u, v, t, np.float32(1))
                 its += 1
                 if extreme > _ABSORB_ABOVE:
@@ -334,7 +342,9 @@ def _sinkhorn(x, y, reg, relative, tol, max_iter, kernel, f, g, u, v, t):  # typ
                 elif count == _PLAIN_ITERATIONS and error < earlier:
                     # plain Sinkhorn contracts by eta an iteration; the best relaxation is 2 / (1 + sqrt(1 - eta))
                     eta = (error / earlier) ** np.float32(1.0 / _CHECK_EVERY)
-                    omega = min(np.float32(2) / (np.float32(1) + np.sqrt(np.float32(1) - eta)), np.float32(1.95))
+                    omega = min(
+                        np.float32(2) / (np.float32(1) + np.sqrt(np.float32(1) - eta)), np.float32(1.95)
+                    )
                 elif count > _PLAIN_ITERATIONS and error > np.float32(4) * best:
                     omega = np.float32(1) + np.float32(0.5) * (omega - np.float32(1))
                     best = error

@@ -35,7 +35,13 @@ def barycentric_images(coupling: Coupling, target: Float32) -> Float64:
 
 
 def carry(
-    points: Float64, source: Float32, target: Float32, coupling: Coupling, method: OutOfSample, *, ridge: float = 1e-3
+    points: Float64,
+    source: Float32,
+    target: Float32,
+    coupling: Coupling,
+    method: OutOfSample,
+    *,
+    ridge: float = 1e-3,
 ) -> Float64:
     """Move points that are not in the source set as the coupling moves the source.
 

@@ -11,6 +11,9 @@ Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 Bool = NDArray[np.bool_]
 
+_ANGLE_STEPS = 2**32  # of a full turn
+_ANGLE_STEP_RAD = 2.0 * math.pi / _ANGLE_STEPS
+
 
 def rotation_z(angle_rad: float) -> Float64:
     """(3, 3) rotation about the z axis, counter-clockwise seen from above (paper eq. 5)."""
@@ -39,7 +42,9 @@ def sector_edges(n_sectors: int) -> Float64:
     return -width / 2.0 + width * np.arange(n_sectors + 1)
 
 
-def in_sector(points: NDArray[np.floating], azimuth_min_rad: float, azimuth_max_rad: float, radius_m: float) -> Bool:
+def in_sector(
+    points: NDArray[np.floating], azimuth_min_rad: float, azimuth_max_rad: float, radius_m: float
+) -> Bool:
     """(N,) which points lie in a cylindrical sector (pie slice) about the origin.
 
     Args:
@@ -48,8 +53,12 @@ def in_sector(points: NDArray[np.floating], azimuth_min_rad: float, azimuth_max_
         azimuth_max_rad: At most 2 pi beyond `azimuth_min_rad`.
         radius_m: Horizontal radius of the cylinder; its height is not bounded.
     """
-    angle = (np.arctan2(points[:, 1], points[:, 0]) - azimuth_min_rad) % (2.0 * np.pi)
-    return (angle < azimuth_max_rad - azimuth_min_rad) & (np.hypot(points[:, 0], points[:, 1]) <= radius_m)
+    # whole steps of 1.5e-9 rad: in floats, a point on the edge of two sectors would now and then fall in both or in neither
+    lower, upper = round(azimuth_min_rad / _ANGLE_STEP_RAD), round(azimuth_max_rad / _ANGLE_STEP_RAD)
+    angle = np.rint(np.arctan2(points[:, 1], points[:, 0]) / _ANGLE_STEP_RAD).astype(np.int64)
+    return ((angle - lower) % _ANGLE_STEPS < upper - lower) & (
+        np.hypot(points[:, 0], points[:, 1]) <= radius_m
+    )
 
 
 def voxel_pick(points: NDArray[np.floating], voxel_m: float) -> NDArray[np.intp]:
@@ -63,7 +72,9 @@ def voxel_pick(points: NDArray[np.floating], voxel_m: float) -> NDArray[np.intp]
     return np.sort(first)
 
 
-def thin(points: NDArray[np.floating], n_max: int, voxel_m: float, rng: np.random.Generator) -> NDArray[np.intp]:
+def thin(
+    points: NDArray[np.floating], n_max: int, voxel_m: float, rng: np.random.Generator
+) -> NDArray[np.intp]:
     """Numbers of at most `n_max` points that cover the set: one a voxel, then a random choice among those."""
     picked = voxel_pick(points, voxel_m)
     if len(picked) > n_max:

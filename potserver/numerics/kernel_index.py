@@ -28,6 +28,8 @@ Int64 = NDArray[np.int64]
 _PROBABILITY_BUDGET = 4e-5  # of a probability, for all cut kernels together
 _TAUS = np.logspace(-3, -12, 10)
 _SAMPLES = 96
+_FRINGE = 25.0  # gamma d^2 out to which samples lie
+_STACK = 4.0  # kernels within a width of each other that are nothing special
 _TARGET_QUERIES_PER_CUBE = 24
 
 
@@ -48,24 +50,47 @@ class KernelIndex(NamedTuple):
 
 def reach(gamma: Float64, weight: Float64, variance: Float64, tau: float, activation_cut: float) -> Float64:
     """(K,) m: where |w| phi < tau, v phi^2 < tau and phi < activation_cut all hold."""
+    return np.sqrt(_log_reach(weight, variance, tau, activation_cut) / gamma)
+
+
+def _log_reach(weight: Float64, variance: Float64, tau: float, activation_cut: float) -> Float64:
     with np.errstate(divide="ignore"):
         log_ratio = np.maximum(np.log(np.abs(weight) / tau), 0.5 * np.log(variance / tau))
-    return np.sqrt(np.maximum(log_ratio, -np.log(activation_cut)) / gamma)
+    return np.maximum(log_ratio, -np.log(activation_cut))
 
 
 def choose_tau(hinge: Float64, gamma: Float64, weight: Float64, variance: Float64) -> float:
     """The largest cut that keeps the probability within budget at sample points.
 
     |dp| <= sum_cut |w| phi / (4 sqrt(1 + pi s2 / 8)) + 0.05 sum_cut v phi^2: the sigmoid's slope is at most 1/4, and the
-    probit scaling's derivative in s2 is below 0.05 everywhere.
+    probit scaling's derivative in s2 is below 0.05 everywhere. The samples lie inside kernels and at their fringes, where
+    what is cut begins.
     """
     rng = np.random.default_rng(0)
     pick = rng.choice(len(hinge), min(_SAMPLES, len(hinge)), replace=False)
-    points = hinge[pick] + rng.normal(0.0, 1.0, (len(pick), 3)) / np.sqrt(2.0 * gamma[pick, None])
+    distance2 = np.where(
+        np.arange(len(pick)) % 2 == 0, rng.chisquare(3, len(pick)) / 2.0, rng.uniform(0.0, _FRINGE, len(pick))
+    )
+    away = rng.normal(0.0, 1.0, (len(pick), 3))
+    points = hinge[pick] + away * np.sqrt(distance2 / gamma[pick] / np.square(away).sum(axis=1))[:, None]
     cut_mean, cut_var, total_var = _cut_sums(points, hinge, gamma, np.abs(weight), variance, _TAUS)
     change = cut_mean / (4.0 * np.sqrt(1.0 + np.pi / 8.0 * total_var[:, None])) + 0.05 * cut_var
     within = change.max(axis=0) <= _PROBABILITY_BUDGET
     return float(_TAUS[np.argmax(within)] if within.any() else _TAUS[-1])
+
+
+def stack_sizes(hinge: Float64, gamma: Float64) -> Float64:
+    """(K,) about how many kernels of a kernel's own width lie within that width of it, itself included.
+
+    Many kernels on one spot (a robot that stands still, and maps that are concatenated) each fall below a cut that their sum
+    does not; a sample of the kernels need not meet such a stack.
+    """
+    level = np.rint(0.5 * np.log2(gamma))
+    cell = np.floor(hinge * np.exp2(level)[:, None])
+    # cells are told apart by a mixed number, not by sorting rows: a rare collision only widens a reach
+    key = (cell @ np.array([1.0, 7919.0, 104729.0]) + 15485863.0 * level).astype(np.int64)
+    _, inverse, count = np.unique(key, return_inverse=True, return_counts=True)
+    return count[inverse].astype(np.float64)
 
 
 def build_index(
@@ -76,6 +101,7 @@ def build_index(
     *,
     activation_cut: float,
     tau: float | None = None,
+    guard_stacks: bool = True,
 ) -> KernelIndex:
     """Sort kernels for fast sums.
 
@@ -86,12 +112,16 @@ def build_index(
         variance: (K,) log-odds^2, >= 0.
         activation_cut: phi below this is left out of the activation sum too.
         tau: The cut, if it is known already; measured otherwise.
+        guard_stacks: Let kernels that lie on one spot reach farther, because their sum falls below a cut later than each does.
     """
     hinge = np.ascontiguousarray(hinge, np.float64)
     gamma, weight, variance = (np.asarray(a, np.float64) for a in (gamma, weight, variance))
     if tau is None:
         tau = choose_tau(hinge, gamma, weight, variance) if len(hinge) else float(_TAUS[0])
-    r = reach(gamma, weight, variance, tau, activation_cut)
+    exponent = _log_reach(weight, variance, tau, activation_cut)
+    if guard_stacks:
+        exponent += np.log(np.maximum(stack_sizes(hinge, gamma) / _STACK, 1.0))
+    r = np.sqrt(exponent / gamma)
     # levels halve the reach; a floor keeps one tiny kernel from making a level of its own
     top = float(r.max(initial=1e-3))
     level = np.clip(np.ceil(np.log2(np.maximum(r, 1e-6) / top)).astype(np.int64), -12, 0)
@@ -205,10 +235,15 @@ def sparse_features(
         cut: Smallest phi that is kept, in (0, 1).
     """
     ones = np.ones(len(hinge))
-    index = build_index(hinge, gamma, ones, np.zeros(len(hinge)), activation_cut=cut, tau=cut)
+    index = build_index(
+        hinge, gamma, ones, np.zeros(len(hinge)), activation_cut=cut, tau=cut, guard_stacks=False
+    )
     if len(points) == 0 or len(hinge) == 0:
         return SparseFeatures(
-            np.arange(len(points)), np.zeros(len(points) + 1, np.int64), np.zeros(0, np.int32), np.zeros(0, np.float32)
+            np.arange(len(points)),
+            np.zeros(len(points) + 1, np.int64),
+            np.zeros(0, np.int32),
+            np.zeros(0, np.float32),
         )
     order, cuts = group_points(points, index.median_reach_m)
     grouped = points[order]
@@ -268,7 +303,9 @@ def _lower_bound(keys, low, high, key):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(nogil=True, error_model="numpy", cache=True)
-def _gather(box_lower, box_upper, hinge, columns, level_start, level_edge, level_cell, level_size, keys, found):  # type: ignore[no-untyped-def]
+def _gather(
+    box_lower, box_upper, hinge, columns, level_start, level_edge, level_cell, level_size, keys, found
+):  # type: ignore[no-untyped-def]
     """Numbers (in index order) of the kernels that reach the box; returns how many, and the buffer, grown if need be."""
     n = 0
     for level in range(len(level_edge)):
@@ -281,14 +318,17 @@ def _gather(box_lower, box_upper, hinge, columns, level_start, level_edge, level
         x1 = min(int(np.floor(box_upper[0] / edge)) + 1 - level_cell[level, 0], nx - 1)
         y1 = min(int(np.floor(box_upper[1] / edge)) + 1 - level_cell[level, 1], ny - 1)
         z1 = min(int(np.floor(box_upper[2] / edge)) + 1 - level_cell[level, 2], nz - 1)
-        if x1 < x0:
+        if x1 < x0 or y1 < y0 or z1 < z0:
             continue
-        for z in range(z0, z1 + 1):
-            for y in range(y0, y1 + 1):
+        # a box over more rows of small cells than the level has kernels: one row that holds them all
+        whole = (y1 - y0 + 1) * (z1 - z0 + 1) > last - first
+        rows_z, rows_y = (1, 1) if whole else (z1 - z0 + 1, y1 - y0 + 1)
+        for z in range(z0, z0 + rows_z):
+            for y in range(y0, y0 + rows_y):
                 row = (z * ny + y) * nx
-                low = _lower_bound(keys, first, last, row + x0)
+                low = first if whole else _lower_bound(keys, first, last, row + x0)
                 for m in range(low, last):
-                    if keys[m] > row + x1:
+                    if not whole and keys[m] > row + x1:
                         break
                     d2 = 0.0
                     for c in range(3):
@@ -363,7 +403,9 @@ def _sum_cubes(points, cuts, hinge, columns, level_start, level_edge, level_cell
 
 
 @nb.njit(nogil=True, error_model="numpy", cache=True)
-def _feature_rows(points, cuts, hinge, columns, order, level_start, level_edge, level_cell, level_size, keys, cut):  # type: ignore[no-untyped-def]
+def _feature_rows(
+    points, cuts, hinge, columns, order, level_start, level_edge, level_cell, level_size, keys, cut
+):  # type: ignore[no-untyped-def]
     first, last = cuts[0], cuts[-1]
     counts = np.zeros(last - first, np.int64)
     capacity = 32 * (last - first) + 1024

@@ -75,12 +75,18 @@ def fit_sparse(
 
     def latent(weights: Float32) -> Float32:
         out = np.empty(n, np.float32)
-        parallel_map(lambda s: _rows_dot(features.indptr, features.indices, features.values, weights, s[0], s[1], out), rows, threads)
+        parallel_map(
+            lambda s: _rows_dot(features.indptr, features.indices, features.values, weights, s[0], s[1], out),
+            rows,
+            threads,
+        )
         return out
 
     def transposed(vector: Float32, *, square: bool = False) -> Float32:
         parts = parallel_map(
-            lambda s: _rows_scatter(features.indptr, features.indices, features.values, vector, s[0], s[1], k, square),
+            lambda s: _rows_scatter(
+                features.indptr, features.indices, features.values, vector, s[0], s[1], k, square
+            ),
             rows,
             threads,
         )
@@ -88,7 +94,9 @@ def fit_sparse(
 
     def curvature_times(direction: Float32, curvature: Float32) -> Float32:
         parts = parallel_map(
-            lambda s: _rows_normal(features.indptr, features.indices, features.values, curvature, direction, s[0], s[1]),
+            lambda s: _rows_normal(
+                features.indptr, features.indices, features.values, curvature, direction, s[0], s[1]
+            ),
             rows,
             threads,
         )
@@ -96,7 +104,9 @@ def fit_sparse(
 
     def objective(f: Float32, w: Float32) -> float:
         loss = np.logaddexp(0.0, f, dtype=np.float64) - y * f
-        return float((count * loss).sum() + 0.5 * (precision * np.square(w - prior_mean, dtype=np.float64)).sum())
+        return float(
+            (count * loss).sum() + 0.5 * (precision * np.square(w - prior_mean, dtype=np.float64)).sum()
+        )
 
     # far from the data's answer the curvature vanishes and Newton crawls: start from the prior or from zero, whichever is nearer
     w = prior_mean.astype(np.float32).copy()
@@ -122,7 +132,11 @@ def fit_sparse(
         # inexact Newton: far from the optimum a rough step is as good as an exact one
         forcing = min(0.1, math.sqrt(norm / start_norm))
         step, used = _conjugate_gradient(
-            lambda d: curvature_times(d, curvature), -gradient, diagonal, forcing, max_conjugate_gradient  # noqa: B023
+            lambda d: curvature_times(d, curvature),
+            -gradient,
+            diagonal,
+            forcing,
+            max_conjugate_gradient,  # noqa: B023
         )
         n_newton += 1
         n_cg += used
@@ -147,10 +161,14 @@ def fit_sparse(
         diagonal = transposed(count * p * (1.0 - p), square=True) + precision
     else:
         diagonal = precision
-    return WeightPosterior(w, 1.0 / diagonal, n_newton, n_cg, norm / start_norm if start_norm else 0.0, bool(converged))
+    return WeightPosterior(
+        w, 1.0 / diagonal, n_newton, n_cg, norm / start_norm if start_norm else 0.0, bool(converged)
+    )
 
 
-def _conjugate_gradient(apply, rhs: Float32, diagonal: Float32, forcing: float, max_steps: int) -> tuple[Float32, int]:  # type: ignore[no-untyped-def]
+def _conjugate_gradient(
+    apply, rhs: Float32, diagonal: Float32, forcing: float, max_steps: int
+) -> tuple[Float32, int]:  # type: ignore[no-untyped-def]
     """Solve A x = rhs with a Jacobi preconditioner until the residual has shrunk by `forcing`."""
     x = np.zeros_like(rhs)
     r = rhs.copy()

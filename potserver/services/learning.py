@@ -85,7 +85,9 @@ def learn_atoms(
     return atoms
 
 
-def _learn(points: Float64, occupied: np.ndarray, settings: LearningSettings) -> tuple[KernelSet, float, float]:
+def _learn(
+    points: Float64, occupied: np.ndarray, settings: LearningSettings
+) -> tuple[KernelSet, float, float]:
     placed = KernelSet.concatenate(
         [place_kernels(points, settings.coarse_m, 1.0), place_kernels(points[occupied], settings.fine_m, 1.0)]
     )
@@ -122,7 +124,9 @@ def choose_diverse(atoms: list[Atom], n: int, *, threads: int = 1) -> AtomDictio
         raise SettingsError(f"cannot choose {n} atoms")
     rng = np.random.default_rng(0)
     distance = np.zeros((len(atoms), len(atoms)))
-    pairs = np.stack(np.meshgrid(np.arange(len(atoms)), np.arange(len(atoms)), indexing="ij"), axis=-1).reshape(-1, 2)
+    pairs = np.stack(
+        np.meshgrid(np.arange(len(atoms)), np.arange(len(atoms)), indexing="ij"), axis=-1
+    ).reshape(-1, 2)
     for points_of, count in ((lambda a: a.hit_points, 100), (lambda a: a.free_points, 60)):
         sets = []
         for atom in atoms:

@@ -11,7 +11,16 @@ import numpy as np
 
 from potserver.domain.dictionary import AtomDictionary
 from potserver.domain.kernel_map import KernelMap
-from potserver.domain.types import Float64, KernelSet, MapUpdate, Scan, Sector, SectorMatch, TileChange, yaw_pose
+from potserver.domain.types import (
+    Float64,
+    KernelSet,
+    MapUpdate,
+    Scan,
+    Sector,
+    SectorMatch,
+    TileChange,
+    yaw_pose,
+)
 from potserver.errors import EmptyError
 from potserver.numerics.beams import Beams, LabelledPoints, label_beams, limit_range
 from potserver.numerics.geometry import in_sector, rotation_z, sector_edges, yaw_of
@@ -52,7 +61,8 @@ class MappingService:
         self._threads = threads or default_threads()
         self._seed = seed
         self._matchers = {
-            dims: Matcher(self.dictionary.of_dims(dims), self.settings, threads=self._threads, seed=seed) for dims in (2, 3)
+            dims: Matcher(self.dictionary.of_dims(dims), self.settings, threads=self._threads, seed=seed)
+            for dims in (2, 3)
         }
         self.snapshot = self._map_of(KernelSet.empty(), revision=0)
 
@@ -66,7 +76,9 @@ class MappingService:
         rng = np.random.default_rng((self._seed, self.n_scans))
         with clock("label"):
             beams = self._beams(scan, rng)
-            labelled = label_beams(beams, free_per_beam=self.settings.free_per_beam, gap_m=self.settings.gap_m, rng=rng)
+            labelled = label_beams(
+                beams, free_per_beam=self.settings.free_per_beam, gap_m=self.settings.gap_m, rng=rng
+            )
             sectors = self._cut_sectors(labelled, scan)
         with clock("match"):
             matches = self._matchers[2 if scan.is_planar else 3].match(sectors)
@@ -76,7 +88,9 @@ class MappingService:
         in_map = labelled._replace(points=labelled.points + scan.origin)
         if self.settings.refine:
             with clock("refine"):
-                prior = carried.replace(weight_var=carried.weight_var + np.float32(self.settings.borrowed_var))
+                prior = carried.replace(
+                    weight_var=carried.weight_var + np.float32(self.settings.borrowed_var)
+                )
                 instantaneous, _ = refine(prior, in_map, self.settings, threads=self._threads)
             with clock("fuse"):
                 kernels, added = self._fuse(prior, in_map)
@@ -88,7 +102,9 @@ class MappingService:
         # nothing above changed the service; from here on nothing can fail
         self.snapshot = snapshot
         self.n_scans += 1
-        self.atom_usage.update(m.atom.atom_id for m, t in zip(matches, transported, strict=True) if m and t and t.converged)
+        self.atom_usage.update(
+            m.atom.atom_id for m, t in zip(matches, transported, strict=True) if m and t and t.converged
+        )
         return MapUpdate(
             map_revision=snapshot.map_revision,
             kernels=instantaneous,
@@ -152,8 +168,11 @@ class MappingService:
             local = (labelled.points @ rotation).astype(np.float32)  # R^T p, row by row
             sectors.append(
                 Sector(
-                    azimuth_min_rad=float(heading + low - turn), azimuth_max_rad=float(heading + high - turn), radius_m=radius,
-                    hit_points=local[members & labelled.occupied], free_points=local[members & ~labelled.occupied],
+                    azimuth_min_rad=float(heading + low - turn),
+                    azimuth_max_rad=float(heading + high - turn),
+                    radius_m=radius,
+                    hit_points=local[members & labelled.occupied],
+                    free_points=local[members & ~labelled.occupied],
                     T_map_sector=T,
                 )  # fmt: skip
             )
@@ -186,7 +205,9 @@ class MappingService:
             for scale in (False, True):
                 members = is_fine(carried, s) == scale
                 same = local.take(is_fine(local, s) == scale)
-                present_activation[members] = activation(same, carried.hinge_mean[members], threads=self._threads)
+                present_activation[members] = activation(
+                    same, carried.hinge_mean[members], threads=self._threads
+                )
             carried = carried.take(present_activation < s.explained_activation)
         filled = fill_kernels(labelled, KernelSet.concatenate([local, carried]), s, threads=self._threads)
         new = KernelSet.concatenate([carried, filled])
@@ -196,7 +217,11 @@ class MappingService:
     def _support(self, kernels: KernelSet, labelled: LabelledPoints) -> np.ndarray:
         """(K,) how many labelled points each kernel has, each counted by its activation."""
         features = sparse_features(
-            labelled.points, kernels.hinge_mean, kernels.gamma.astype(np.float64), cut=0.1, threads=self._threads
+            labelled.points,
+            kernels.hinge_mean,
+            kernels.gamma.astype(np.float64),
+            cut=0.1,
+            threads=self._threads,
         )
         return np.bincount(features.indices, features.values, len(kernels))
 
@@ -208,7 +233,7 @@ class MappingService:
     def _map_of(self, kernels: KernelSet, *, revision: int) -> KernelMap:
         return KernelMap(
             kernels, observed_activation=self.settings.observed_activation, prior_var=self.settings.prior_var,
-            map_revision=revision, threads=self._threads,
+            residual_var=self.settings.residual_var, map_revision=revision, threads=self._threads,
         )  # fmt: skip
 
 
@@ -216,7 +241,11 @@ def _report(sector: Sector, match: Match | None, transported: Transported | None
     turn = yaw_of(sector.T_map_sector)
     reason = None
     if match is None or transported is None:
-        reason = "nothing in the sector" if len(sector.hit_points) + len(sector.free_points) == 0 else "no atom is comparable"
+        reason = (
+            "nothing in the sector"
+            if len(sector.hit_points) + len(sector.free_points) == 0
+            else "no atom is comparable"
+        )
     elif not transported.converged:
         reason = "the coupling did not converge"
     return SectorMatch(

@@ -32,7 +32,9 @@ def centre_of(hit_points: Float32, free_points: Float32) -> Float64:
 class Matcher:
     """Ranks every atom of a dictionary, in every rotation, against the sectors of a scan."""
 
-    def __init__(self, dictionary: AtomDictionary, settings: MappingSettings, *, threads: int, seed: int) -> None:
+    def __init__(
+        self, dictionary: AtomDictionary, settings: MappingSettings, *, threads: int, seed: int
+    ) -> None:
         """Subsample, centre and rotate the atoms once."""
         self._settings = settings
         self._threads = threads
@@ -73,8 +75,22 @@ class Matcher:
                 continue
             centre = centre_of(sector.hit_points, sector.free_points)
             for points, count, sets, pairs, rows, candidate_sets in (
-                (sector.hit_points, self._settings.rank_hits, target_hits, hit_pairs, rows_hits, self._hit_set),
-                (sector.free_points, self._settings.rank_free, target_free, free_pairs, rows_free, self._free_set),
+                (
+                    sector.hit_points,
+                    self._settings.rank_hits,
+                    target_hits,
+                    hit_pairs,
+                    rows_hits,
+                    self._hit_set,
+                ),
+                (
+                    sector.free_points,
+                    self._settings.rank_free,
+                    target_free,
+                    free_pairs,
+                    rows_free,
+                    self._free_set,
+                ),
             ):
                 if len(points) == 0:
                     continue
@@ -85,12 +101,16 @@ class Matcher:
                         pairs.append((number, len(sets) - 1))
         hits = self._solve(self._hits, target_hits, hit_pairs)
         free = self._solve(self._free, target_free, free_pairs)
-        return [self._best(sector, rows_hits[s], rows_free[s], hits, free) for s, sector in enumerate(sectors)]
+        return [
+            self._best(sector, rows_hits[s], rows_free[s], hits, free) for s, sector in enumerate(sectors)
+        ]
 
     def _subsample(self, points: Float32, n: int, rng: np.random.Generator) -> Float32:
         return points[thin(points, n, _RANK_VOXEL_M, rng)]
 
-    def _solve(self, sources: Ragged, targets: list[Float32], pairs: list[tuple[int, int]]) -> tuple[Float64, np.ndarray]:
+    def _solve(
+        self, sources: Ragged, targets: list[Float32], pairs: list[tuple[int, int]]
+    ) -> tuple[Float64, np.ndarray]:
         s = self._settings
         solved = coupling_costs(
             sources, Ragged.of(targets), np.asarray(pairs, np.int64).reshape(-1, 2), reg=s.rank_reg_m2,
@@ -103,7 +123,10 @@ class Matcher:
         w2 = np.zeros(len(self._candidates))
         converged = np.ones(len(self._candidates), bool)
         compared = False
-        for points, rows, (cost, ok) in ((sector.hit_points, rows_hits, hits), (sector.free_points, rows_free, free)):
+        for points, rows, (cost, ok) in (
+            (sector.hit_points, rows_hits, hits),
+            (sector.free_points, rows_free, free),
+        ):
             if len(points) == 0:
                 continue  # rank by the other label alone
             known = rows >= 0

@@ -71,7 +71,9 @@ class QueryService:
         self._check_coordinates(array)
         return self._mapping.snapshot.occupancy(array)
 
-    def grid(self, lower: ArrayLike, upper: ArrayLike, resolution: float, *, part_cells: int = 50_000) -> GridPlan:
+    def grid(
+        self, lower: ArrayLike, upper: ArrayLike, resolution: float, *, part_cells: int = 50_000
+    ) -> GridPlan:
         """Plan a grid over a box; cells start at `lower` and the last ones reach or pass `upper`.
 
         Raises:
@@ -87,7 +89,9 @@ class QueryService:
         # half a millionth of slack, so that a box of 10 m at 0.1 m has 100 cells and not 101
         counts = np.maximum(np.ceil((high - low) / resolution - 5e-7), 1.0)
         if float(np.prod(counts)) > self.max_grid_cells:
-            raise TooLargeError(f"{np.prod(counts):.3g} cells, the limit is {self.max_grid_cells}; ask for a coarser or smaller grid")
+            raise TooLargeError(
+                f"{np.prod(counts):.3g} cells, the limit is {self.max_grid_cells}; ask for a coarser or smaller grid"
+            )
         nx, ny, nz = (int(c) for c in counts)
         return GridPlan(self._mapping.snapshot, low, float(resolution), (nx, ny, nz), part_cells)
 
@@ -122,4 +126,6 @@ class QueryService:
     def _check_coordinates(self, array: Float64) -> None:
         farthest = float(np.abs(array).max(initial=0.0))
         if farthest > self.max_coordinate_m:
-            raise OutOfRangeError(f"a coordinate of {farthest:.3g} m, the limit is {self.max_coordinate_m:.3g} m")
+            raise OutOfRangeError(
+                f"a coordinate of {farthest:.3g} m, the limit is {self.max_coordinate_m:.3g} m"
+            )

@@ -45,7 +45,9 @@ def place_kernels(points: Float64, spacing_m: float, prior_var: float) -> Kernel
     )
 
 
-def fill_kernels(labelled: LabelledPoints, known: KernelSet, settings: MappingSettings, *, threads: int) -> KernelSet:
+def fill_kernels(
+    labelled: LabelledPoints, known: KernelSet, settings: MappingSettings, *, threads: int
+) -> KernelSet:
     """Kernels for the points that `known` does not explain: coarse ones anywhere, fine ones at hits.
 
     A point is explained when the kernels of the right scale sum to at least `explained_activation` there.
@@ -56,7 +58,9 @@ def fill_kernels(labelled: LabelledPoints, known: KernelSet, settings: MappingSe
         parts.append(_fill(labelled.points, wide, settings.fill_coarse_m, settings, threads))
     if settings.fill_fine_m:
         narrow = known.take(is_fine(known, settings))
-        parts.append(_fill(labelled.points[labelled.occupied], narrow, settings.fill_fine_m, settings, threads))
+        parts.append(
+            _fill(labelled.points[labelled.occupied], narrow, settings.fill_fine_m, settings, threads)
+        )
     return KernelSet.concatenate(parts)
 
 
@@ -68,7 +72,9 @@ def is_fine(kernels: KernelSet, settings: MappingSettings) -> np.ndarray:
     return kernels.gamma > np.sqrt(gamma_of_spacing(coarse) * gamma_of_spacing(fine))
 
 
-def _fill(points: Float64, known: KernelSet, spacing_m: float, settings: MappingSettings, threads: int) -> KernelSet:
+def _fill(
+    points: Float64, known: KernelSet, spacing_m: float, settings: MappingSettings, threads: int
+) -> KernelSet:
     if len(points) and len(known):
         points = points[activation(known, points, threads=threads) < settings.explained_activation]
     return place_kernels(points, spacing_m, settings.prior_var)
@@ -88,7 +94,11 @@ def refine(
 ) -> tuple[KernelSet, WeightPosterior]:
     """Solve all weights of `kernels` jointly on labelled points; their present mean and variance are the prior."""
     features = sparse_features(
-        labelled.points, kernels.hinge_mean, kernels.gamma.astype(np.float64), cut=settings.feature_cut, threads=threads
+        labelled.points,
+        kernels.hinge_mean,
+        kernels.gamma.astype(np.float64),
+        cut=settings.feature_cut,
+        threads=threads,
     )
     posterior = fit_sparse(
         features, labelled.occupied, kernels.weight_mean, kernels.weight_var,

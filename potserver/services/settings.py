@@ -14,7 +14,9 @@ class RankScore(str, Enum):
     """How atoms are ranked against a sector."""
 
     W2 = "w2"  # eq. 7: squared 2-Wasserstein distance of hits plus that of free points
-    NORMALISED = "normalised"  # the authors' code: each divided by its largest over all candidates, then added
+    NORMALISED = (
+        "normalised"  # the authors' code: each divided by its largest over all candidates, then added
+    )
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -32,8 +34,12 @@ class MappingSettings:
 
     # sectors
     n_sectors: int = 6
-    align_sectors: bool = True  # turn each sector to its bisector, as atoms are; false: to the map's axes (authors)
-    keep_in_sector: bool = True  # transported kernels outside their sector are left out; false: outside the circle (authors)
+    align_sectors: bool = (
+        True  # turn each sector to its bisector, as atoms are; false: to the map's axes (authors)
+    )
+    keep_in_sector: bool = (
+        True  # transported kernels outside their sector are left out; false: outside the circle (authors)
+    )
 
     # ranking (eq. 6-7)
     rank_hits: int = 100
@@ -49,13 +55,17 @@ class MappingSettings:
     couple_reg: float = 0.0005  # of the largest cost
     couple_tolerance: float = 1e-3
     couple_iterations: int = 2000
-    label_aware: bool = True  # free-space kernels move with the free points' own coupling; false: with the hits'
+    label_aware: bool = (
+        True  # free-space kernels move with the free points' own coupling; false: with the hits'
+    )
     out_of_sample: OutOfSample = OutOfSample.NEAREST
 
     # refinement (RePOT)
     refine: bool = True
     prior_var: float = 50.0  # log-odds^2, of kernels without a transported prior
-    borrowed_var: float = 25.0  # log-odds^2, added to the variance of transported weights: borrowed is not seen
+    borrowed_var: float = (
+        25.0  # log-odds^2, added to the variance of transported weights: borrowed is not seen
+    )
     fill_coarse_m: float = 1.0  # spacing of kernels added where nothing explains a point; 0 adds none
     fill_fine_m: float = 0.3  # the same near hits
     feature_cut: float = 0.01  # activations below this are left out of the solve
@@ -63,11 +73,12 @@ class MappingSettings:
     explained_activation: float = 1.0  # a point with less from kernels of the right scale gets one of its own
 
     # answers
-    observed_activation: float = 0.05
+    observed_activation: float = 0.05  # with less around it, a point is unobserved
+    residual_var: float = 50.0  # log-odds^2, see KernelMap; 0 is the paper's model
     tile_size_m: float = 10.0  # granularity of change notices
 
     def __post_init__(self) -> None:
-        for name in ("min_range_m", "gap_m", "fill_coarse_m", "fill_fine_m", "borrowed_var"):
+        for name in ("min_range_m", "gap_m", "fill_coarse_m", "fill_fine_m", "borrowed_var", "residual_var"):
             self._need(name, getattr(self, name) >= 0, "at least 0")
         for name in (
             "max_range_m", "free_per_beam", "beams_per_scan", "n_sectors", "rank_hits", "rank_free", "rank_reg_m2",
@@ -124,6 +135,7 @@ PAPER = MappingSettings(
     refine=False,
     fill_coarse_m=0.0,
     fill_fine_m=0.0,
+    residual_var=0.0,
 )
 
 PROFILES = {"default": MappingSettings(), "paper": PAPER}

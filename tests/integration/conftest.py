@@ -73,7 +73,11 @@ class Client:
             encoding = encoding or wire.encoding_of(payload)
             payload = wire.encode(payload)
         replies = self.session.get(
-            key, payload=payload, encoding=encoding, timeout=timeout_s, consolidation=zenoh.ConsolidationMode.NONE
+            key,
+            payload=payload,
+            encoding=encoding,
+            timeout=timeout_s,
+            consolidation=zenoh.ConsolidationMode.NONE,
         )
         answers = []
         for reply in replies:
@@ -161,7 +165,7 @@ def points_query(points: Any, **changes: Any) -> messages.PointsQuery:
     return messages.PointsQuery(points=wire.encode_array(np.asarray(points, np.float64)), **changes)
 
 
-# --- a mapper without mathematics, that can be held -------------------------------------------------------------------
+# --- a mapper without mathematics, that can be held ---------------------------------------------------------
 
 
 class FakeSnapshot:

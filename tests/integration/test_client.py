@@ -7,6 +7,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -36,6 +37,7 @@ from potschemas import messages
 from potschemas.messages import ErrorCode, ReceiptStatus
 from tests.integration.fake_server import FakeServer, free_port
 
+ROOT = Path(__file__).resolve().parents[2]
 LIMIT_S = 30.0  # of a wait that must succeed; no test measures it
 
 
@@ -406,6 +408,42 @@ def test_a_server_that_thinks_for_ever(server: FakeServer, client: MapClient) ->
         client.info(timeout_s=0.1)
 
 
+def test_a_server_that_is_killed_with_the_question_in_flight() -> None:
+    program = """
+import sys
+from tests.integration.fake_server import FakeServer
+server = FakeServer()
+server.script.hold = {"points"}
+print(server.endpoint, flush=True)
+while "points" not in server.queries:
+    pass
+print("asked", flush=True)
+sys.stdin.read()
+"""
+    process = subprocess.Popen(
+        [sys.executable, "-c", program], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, cwd=ROOT
+    )
+    assert process.stdin is not None
+    assert process.stdout is not None
+    with process, MapClient(process.stdout.readline().strip(), timeout_s=LIMIT_S) as client:
+        client.wait_ready(LIMIT_S)
+        errors: list[PotclientError] = []
+
+        def ask() -> None:
+            try:
+                client.occupancy(cloud())
+            except PotclientError as error:
+                errors.append(error)
+
+        asking = threading.Thread(target=ask, daemon=True)
+        asking.start()
+        assert process.stdout.readline() == "asked\n"
+        process.kill()
+        asking.join(LIMIT_S)
+    assert [type(e) for e in errors] in ([NoServerError], [LostReplyError])
+    assert errors[0].retryable
+
+
 def test_an_answer_that_is_no_message(server: FakeServer, client: MapClient) -> None:
     server.script.garbage = {"points", "grid"}
     with pytest.raises(BadReplyError):
@@ -475,8 +513,10 @@ def test_closing_from_a_callback_ends(server: FakeServer) -> None:
     assert closed.wait(LIMIT_S)
 
 
-@pytest.mark.parametrize("ending", ["pass", "raise SystemExit(3)", "raise RuntimeError('x')"])
-def test_a_process_that_forgets_to_close_ends(server: FakeServer, ending: str) -> None:
+@pytest.mark.parametrize(
+    ("ending", "status"), [("pass", 0), ("raise SystemExit(3)", 3), ("raise RuntimeError('x')", 1)]
+)
+def test_a_process_that_forgets_to_close_ends(server: FakeServer, ending: str, status: int) -> None:
     program = f"""
 import numpy as np
 from potclient import MapClient
@@ -486,7 +526,10 @@ client.publish(np.ones((5, 3)), np.eye(4), wait=True)
 client.info()
 {ending}
 """
-    subprocess.run([sys.executable, "-c", program], timeout=LIMIT_S * 2, capture_output=True, check=False)
+    done = subprocess.run(
+        [sys.executable, "-c", program], timeout=LIMIT_S * 2, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == status, done.stderr
 
 
 def test_the_client_imports_nothing_heavy() -> None:

@@ -58,12 +58,14 @@ def drain(inbox: queue.Queue[Any], n: int) -> list[Any]:
 def balance(counters: dict[str, int]) -> int:
     """Clouds received less clouds that ended."""
     ended = sum(
-        n for name, n in counters.items() if name.startswith(("clouds.accepted", "clouds.rejected.", "clouds.dropped."))
+        n
+        for name, n in counters.items()
+        if name.startswith(("clouds.accepted", "clouds.rejected.", "clouds.dropped."))
     )
     return counters["clouds.received"] - ended
 
 
-# --- what an accepted cloud sets off ----------------------------------------------------------------------------------
+# --- what an accepted cloud sets off ------------------------------------------------------------------------
 
 
 def test_a_cloud_gives_one_receipt_its_parameters_and_a_tick(make_rig: MakeRig) -> None:
@@ -138,7 +140,7 @@ def test_a_bug_in_a_query_is_internal_and_the_worker_lives(make_rig: MakeRig) ->
     assert client.stats().counters["queries.points.internal"] == 1
 
 
-# --- load -------------------------------------------------------------------------------------------------------------
+# --- load ---------------------------------------------------------------------------------------------------
 
 
 def test_every_cloud_of_a_flood_gets_exactly_one_receipt(make_rig: MakeRig) -> None:
@@ -276,7 +278,7 @@ def test_a_query_over_the_byte_limit_of_zenoh_itself_is_no_answer_at_all(make_ri
     assert client.one("info").n_kernels == 0
 
 
-# --- who may, and which operations there are ----------------------------------------------------------------------------
+# --- who may, and which operations there are ----------------------------------------------------------------
 
 
 def test_robots_off_the_allow_list_are_refused(make_rig: MakeRig) -> None:
@@ -325,7 +327,7 @@ def test_old_stamps_may_be_allowed(make_rig: MakeRig) -> None:
     assert client.one("integrate", make_cloud(seq=4, robot="r1")).map_revision == 2
 
 
-# --- poses --------------------------------------------------------------------------------------------------------------
+# --- poses --------------------------------------------------------------------------------------------------
 
 
 def _pose_message(stamp_ns: int, x_m: float) -> messages.Pose:
@@ -354,7 +356,9 @@ def test_a_cloud_waits_a_moment_for_the_pose_after_it(make_rig: MakeRig) -> None
     pose = _pose_message(1_000_000_000, 1.0)
     client.put(client.keys.pose("r1"), wire.encode(pose), wire.encoding_of(pose))
     until(lambda: client.stats().counters.get("poses.accepted") == 1, "a pose")
-    waiting = in_background(lambda: client.one("integrate", make_cloud(robot="r1", T_map_sensor=None, stamp_ns=1_100_000_000)))
+    waiting = in_background(
+        lambda: client.one("integrate", make_cloud(robot="r1", T_map_sensor=None, stamp_ns=1_100_000_000))
+    )
     pose = _pose_message(1_200_000_000, 3.0)
     client.put(client.keys.pose("r1"), wire.encode(pose), wire.encoding_of(pose))
     assert waiting().status is ReceiptStatus.ACCEPTED
@@ -374,7 +378,7 @@ def test_bad_poses_are_counted(make_rig: MakeRig) -> None:
     assert "poses.accepted" not in counters
 
 
-# --- control ------------------------------------------------------------------------------------------------------------
+# --- control ------------------------------------------------------------------------------------------------
 
 
 def test_clear_comes_after_the_clouds_before_it_and_forgets_the_stamps(make_rig: MakeRig) -> None:
@@ -433,7 +437,7 @@ def test_drain_maps_what_waits_and_takes_no_more(make_rig: MakeRig) -> None:
     assert client.one("points", HERE).map_revision == 2, "questions are still answered"
 
 
-# --- presence and counters ------------------------------------------------------------------------------------------------
+# --- presence and counters ----------------------------------------------------------------------------------
 
 
 def test_the_token_comes_only_after_the_warm_up(make_rig: MakeRig) -> None:
@@ -466,7 +470,9 @@ def test_stats_come_by_themselves_and_when_asked(make_rig: MakeRig) -> None:
     client = make_rig(stats_period_s=0.05, server_id="s-1").client()
     inbox: queue.Queue[messages.Stats] = queue.Queue()
     key = stats_key(ROOT, "s-1")
-    client.session.declare_subscriber(key, lambda s: inbox.put(wire.decode(s.payload.to_bytes(), messages.Stats)))
+    client.session.declare_subscriber(
+        key, lambda s: inbox.put(wire.decode(s.payload.to_bytes(), messages.Stats))
+    )
     client.one("integrate", make_cloud(robot="r1"))
     client.one("points", HERE)
     first, *_, last = drain(inbox, 4)
@@ -484,7 +490,7 @@ def test_stats_are_put_once_a_second_by_default() -> None:
     assert load_settings().stats_period_s == 1.0
 
 
-# --- several maps -----------------------------------------------------------------------------------------------------------
+# --- several maps -------------------------------------------------------------------------------------------
 
 
 def test_two_maps_share_a_server_and_nothing_else(make_rig: MakeRig) -> None:
@@ -506,7 +512,7 @@ def test_two_maps_share_a_server_and_nothing_else(make_rig: MakeRig) -> None:
     assert {i.map for i in ground.get(f"{ROOT}/*/q/info")} == {"ground", "roof"}
 
 
-# --- life --------------------------------------------------------------------------------------------------------------------
+# --- life ---------------------------------------------------------------------------------------------------
 
 
 def test_stop_maps_what_waits(make_rig: MakeRig) -> None:
@@ -523,7 +529,9 @@ def test_stop_maps_what_waits(make_rig: MakeRig) -> None:
     assert receipts.get(timeout=DEADLINE_S).reason == "shutting_down"
     rig.mapper.mapping.release()
     assert stopped() is True
-    assert [(r.seq, r.status) for r in drain(receipts, 3)] == [(seq, ReceiptStatus.ACCEPTED) for seq in range(3)]
+    assert [(r.seq, r.status) for r in drain(receipts, 3)] == [
+        (seq, ReceiptStatus.ACCEPTED) for seq in range(3)
+    ]
     assert rig.server.stop() is True, "twice does no harm"
     assert client.get(client.keys.query("info")) == []
 
@@ -569,10 +577,21 @@ def test_a_client_killed_in_the_middle_of_a_query_does_no_harm(make_rig: MakeRig
         "s = zenoh.open(c)\n"
         "list(s.get(sys.argv[2], payload=bytes.fromhex(sys.argv[3]), timeout=60))\n"
     )
-    config = {"mode": "client", "connect/endpoints": [rig.server.endpoint], "scouting/multicast/enabled": False}
+    config = {
+        "mode": "client",
+        "connect/endpoints": [rig.server.endpoint],
+        "scouting/multicast/enabled": False,
+    }
     query = messages.GridQuery(lower=[0.0] * 3, upper=[4.0] * 3, resolution=0.1)
     victim = subprocess.Popen(
-        [sys.executable, "-c", script, json.dumps(config), client.keys.query("grid"), wire.encode(query).hex()]
+        [
+            sys.executable,
+            "-c",
+            script,
+            json.dumps(config),
+            client.keys.query("grid"),
+            wire.encode(query).hex(),
+        ]
     )
     try:
         rig.mapper.queries.wait_entered()
@@ -604,9 +623,12 @@ def test_a_robot_that_stops_reading_does_not_stop_the_mapper(make_rig: MakeRig) 
 
 def test_a_taken_port_is_one_clear_line(make_rig: MakeRig) -> None:
     endpoint = make_rig().server.endpoint
-    with pytest.raises(SettingsError, match=f"{endpoint}: the port is taken.*Hint: ") as caught, MapServer(
-        make_map=lambda _: (_fake_mapper(), None),  # type: ignore[arg-type, return-value]
-        listen=endpoint,
+    with (
+        pytest.raises(SettingsError, match=f"{endpoint}: the port is taken.*Hint: ") as caught,
+        MapServer(
+            make_map=lambda _: (_fake_mapper(), None),  # type: ignore[arg-type, return-value]
+            listen=endpoint,
+        ),
     ):
         pass
     assert "\n" not in str(caught.value)
@@ -635,7 +657,7 @@ def test_a_failing_start_leaves_nothing_behind(make_rig: MakeRig) -> None:
 
 
 def test_a_server_can_join_a_router(make_rig: MakeRig) -> None:
-    hub = make_rig(maps=["hub"], server_id="hub", **{"zenoh__mode": "router"})
+    hub = make_rig(maps=["hub"], server_id="hub", zenoh__mode="router")
     spoke = make_rig(server_id="spoke", zenoh__connect=[hub.server.endpoint])
     client = Client(hub.server.endpoint)
     until(lambda: client.alive(f"@{ROOT}/srv/*/default"), "the spoke's token through the router")

@@ -154,7 +154,9 @@ def test_a_bad_cloud_gets_its_reason_and_leaves_the_map(real_client: Client, nam
 
 
 @pytest.mark.parametrize("name", ["nan points", "negative seq", "too many bytes"])
-def test_a_receipt_says_which_cloud_it_is_about_where_that_can_be_read(real_client: Client, name: str) -> None:
+def test_a_receipt_says_which_cloud_it_is_about_where_that_can_be_read(
+    real_client: Client, name: str
+) -> None:
     receipts = real_client.receipts("r1")
     payload, _ = BAD_CLOUDS[name]
     real_client.put(real_client.keys.cloud("r1"), payload, CLOUD)
@@ -268,7 +270,8 @@ def test_planar_clouds_and_float64_points_are_taken(real_client: Client) -> None
     angle = np.linspace(-np.pi, np.pi, 300)
     flat = np.stack([4 * np.cos(angle), 4 * np.sin(angle)], axis=1)
     receipt = real_client.one(
-        "integrate", make_cloud(robot="flat", points=wire.encode_array(flat), is_return=_array(angle < 2, bool))
+        "integrate",
+        make_cloud(robot="flat", points=wire.encode_array(flat), is_return=_array(angle < 2, bool)),
     )
     assert receipt.status is ReceiptStatus.ACCEPTED
     assert receipt.n_points == 300

@@ -81,7 +81,14 @@ def serve(tmp_path: Path) -> Iterator[Any]:
             file = tmp_path / "settings.toml"
             file.write_text("[mapping]\nmax_range_m = 15.0\nbeams_per_scan = 500\n")
             process = Process(
-                "serve", "--settings", str(file), "--log-format", "json", "--listen", "tcp/127.0.0.1:0", *arguments
+                "serve",
+                "--settings",
+                str(file),
+                "--log-format",
+                "json",
+                "--listen",
+                "tcp/127.0.0.1:0",
+                *arguments,
             )
             stack.callback(process.close)
             endpoint = process.event("server_started", START_S)["endpoints"][0] if ready else ""
@@ -131,6 +138,12 @@ def test_a_second_signal_ends_it_at_once(serve: Any) -> None:
     assert process.wait() == 130
     assert "second signal" in process.lines[-1]
     client.close()
+
+
+def test_a_program_that_forgets_to_stop_still_ends() -> None:
+    code = 'from potserver.server import MapServer; MapServer(listen="tcp/127.0.0.1:0").start(); print("started")'
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=START_S)
+    assert (run.returncode, run.stdout, run.stderr) == (0, "started\n", "")
 
 
 def test_a_taken_port_is_one_line_and_exit_code_two(serve: Any) -> None:

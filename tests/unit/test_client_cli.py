@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import re
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ import pytest
 import zenoh
 
 from potclient.cli import build_parser, main
+from potclient.client import MapClient
 from potclient.errors import NoServerError, UsageError
 from potclient.kernels import KernelSet
 from potclient.session import (
@@ -259,6 +261,37 @@ def test_watch_ends_by_itself(run: Run) -> None:
     assert status == 0
     assert "watching map default" in err
     assert out == ""
+
+
+def test_watch_prints_what_happens(run: Run, server: FakeServer) -> None:
+    ended = threading.Event()
+
+    def happen() -> None:
+        with MapClient(server.endpoint) as robot:
+            while not ended.is_set():
+                server.publish_stats()
+                robot.publish(np.ones((3, 3)), np.eye(4), robot="w", wait=True)
+
+    events = threading.Thread(target=happen, daemon=True)
+    events.start()
+    try:
+        status, out, _ = run("watch", "--events", "20")
+        assert status == 0
+        assert len(out.splitlines()) == 20
+        status, lines, _ = run("watch", "--events", "20", "--json", "--no-stats")
+    finally:
+        ended.set()
+        events.join()
+    assert re.search(r"revision \d+: \d+ kernels, 1 tiles changed", out)
+    assert re.search(r"w #\d+ accepted, 1 ms", out)
+    assert "fake serving: default " in out
+    assert {json.loads(line)["event"] for line in lines.splitlines()} == {"revision", "receipt"}
+
+
+def test_waiting_for_a_server_that_never_comes_ends(run: Run) -> None:
+    status, _, err = run("info", "--map", "other", "--wait", "0.05")
+    assert status == 1
+    assert "maps served here: default" in err
 
 
 def test_load_prints_a_table_and_accounts_for_everything(run: Run, tmp_path: Path) -> None:

@@ -199,6 +199,37 @@ def test_a_number_without_a_receipt_cannot_be_used_again(feed: Feed, network: Ne
     assert feed.offer(cloud()) == 8, "own numbers go on after the caller's"
 
 
+def test_the_feed_pauses_longer_after_each_cloud_that_the_server_dropped(
+    feed: Feed, network: Network
+) -> None:
+    seq = feed.offer(cloud())
+    for pause_s in (0.05, 0.1, 0.2, 0.4, 0.8, 1.0, 1.0):
+        assert network.next_seq() == seq
+        feed.settle(receipt(seq, ReceiptStatus.DROPPED))
+        seq = feed.offer(cloud())
+        network.now += 0.99 * pause_s
+        feed.wake()
+        assert feed.counts.waiting == 1
+        network.now += 0.02 * pause_s
+        feed.wake()
+    assert network.next_seq() == seq
+    feed.settle(receipt(seq))
+    seq = feed.offer(cloud())
+    assert network.next_seq() == seq, "an accepted cloud ends the pauses"
+
+
+def test_late_receipts_can_be_waited_for(feed: Feed, network: Network) -> None:
+    seq = feed.offer(cloud())
+    network.next_seq()
+    while feed.counts.unknown < 1:
+        network.now += 100.0
+        feed.wake()
+    assert feed.flush(LIMIT_S)
+    assert not feed.flush(0.0, late=True)
+    feed.settle(receipt(seq))
+    assert feed.flush(LIMIT_S, late=True)
+
+
 def test_a_put_that_fails_was_not_sent(feed: Feed, network: Network) -> None:
     network.error = RuntimeError("session closed")
     feed.offer(cloud())

@@ -39,7 +39,9 @@ def test_it_turns_the_shorter_way() -> None:
 
 
 @given(st.integers(0, 2**31), st.integers(0, 2**31), st.floats(0, 1))
-def test_interpolation_is_rigid_meets_its_ends_and_turns_with_the_frame(a: int, b: int, fraction: float) -> None:
+def test_interpolation_is_rigid_meets_its_ends_and_turns_with_the_frame(
+    a: int, b: int, fraction: float
+) -> None:
     start, end, turn = random_pose(a), random_pose(b), random_pose(a ^ b)
     pose = interpolate(start, end, fraction)
     np.testing.assert_allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-9)
@@ -61,7 +63,12 @@ def test_poses_may_come_out_of_order() -> None:
 
 @pytest.mark.parametrize(
     ("robot", "ms", "why"),
-    [("r", 9, "older than"), ("r", 31, "ends 1.0 ms before"), ("r", 25, "10 ms apart"), ("x", 15, "no pose stream")],
+    [
+        ("r", 9, "older than"),
+        ("r", 31, "ends 1.0 ms before"),
+        ("r", 25, "10 ms apart"),
+        ("x", 15, "no pose stream"),
+    ],
 )
 def test_outside_the_buffer_there_is_no_pose(robot: str, ms: int, why: str) -> None:
     poses = PoseBuffer(max_gap_s=0.009)
