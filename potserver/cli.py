@@ -61,12 +61,16 @@ _ATOMS_INFO = """\
 List the atoms of a dictionary: the learned pieces of scans that are carried to each new cloud."""
 
 
+_ATOMS_BUILD = """\
+Learn atoms from recordings, keep those that differ most, score them on beams they never saw, and write a dictionary."""
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point of the `potserver` command; returns the exit code."""
     arguments = list(sys.argv[1:] if argv is None else argv)
     if arguments[:1] == ["demo"]:  # it has a parser of its own
         return _demo(arguments[1:])
-    parser = _parser()
+    parser = _parser(building=arguments[:2] == ["atoms", "build"])
     options = parser.parse_args(arguments)
     if not hasattr(options, "run"):
         parser.print_help()
@@ -145,6 +149,16 @@ def _atoms_info(options: argparse.Namespace) -> int:
     return EXIT_OK
 
 
+def _atoms_build(options: argparse.Namespace) -> int:
+    from potserver import atom_builder
+
+    configure_logging("info", "auto")
+    dictionary = atom_builder.run(options)
+    n_kernels = sum(len(atom.kernels) for atom in dictionary)
+    _say(f"{len(dictionary)} atoms, {n_kernels} kernels, written to {options.out}")
+    return EXIT_OK
+
+
 def _demo(arguments: list[str]) -> int:
     try:
         demo = importlib.import_module("potserver.demo")
@@ -204,7 +218,7 @@ class _Formatter(argparse.RawDescriptionHelpFormatter):
         super().__init__(prog, max_help_position=34, width=110)
 
 
-def _parser() -> argparse.ArgumentParser:
+def _parser(*, building: bool) -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="potserver",
         description=_ABOUT,
@@ -243,8 +257,20 @@ def _parser() -> argparse.ArgumentParser:
     _add_settings_flags(info)
     info.set_defaults(run=_atoms_info)
 
+    build = atoms_commands.add_parser(
+        "build",
+        help="learn a dictionary from recordings",
+        description=_ATOMS_BUILD,
+        formatter_class=_Formatter,
+    )
+    if building:  # its flags come with the learner, which no other command needs
+        from potserver import atom_builder
+
+        atom_builder.add_arguments(build)
+    build.set_defaults(run=_atoms_build)
+
     commands.add_parser(
-        "demo", help="watch a small town being mapped; see `potserver demo --help`", add_help=False
+        "demo", help="map recorded scans through a real server, and score the maps", add_help=False
     )
     return parser
 

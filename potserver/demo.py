@@ -1,4 +1,4 @@
-"""`potserver demo`: real scans through a real Zenoh session into a map server, and what the maps say about beams they never saw."""
+"""`potserver demo`: recorded scans through a real Zenoh session, and what the maps say about beams they never saw."""
 
 from __future__ import annotations
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import atexit
 import contextlib
+import dataclasses
 import functools
 import logging
 import math
@@ -19,6 +20,7 @@ from collections.abc import Callable, Iterator
 from types import TracebackType
 from typing import Any, TypeVar
 
+import msgspec
 import numpy as np
 import zenoh
 from numpy.typing import ArrayLike, NDArray
@@ -923,8 +925,6 @@ def _cloud(
 
 
 def _numbered(cloud: messages.Cloud, seq: int, stamp_ns: int) -> messages.Cloud:
-    import msgspec
-
     return msgspec.structs.replace(cloud, seq=seq, stamp_ns=stamp_ns)
 
 
@@ -956,6 +956,4 @@ def _legal_id(value: str, what: str) -> str:
 
 
 def _with_endpoint(options: SessionOptions, endpoint: str) -> SessionOptions:
-    import dataclasses
-
     return options if options.connect else dataclasses.replace(options, connect=(endpoint,))

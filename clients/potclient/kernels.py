@@ -39,6 +39,7 @@ class KernelSet:
     weight_var: Float32  # (K,) log-odds^2
     observed_activation: float  # summed activation below which a point counts as unobserved
     prior_var: float  # log-odds^2, the latent variance of an unobserved point
+    residual_var: float  # log-odds^2, added in the measure that the summed activation falls short of 1
     map_revision: int = 0
 
     def __post_init__(self) -> None:
@@ -69,8 +70,8 @@ class KernelSet:
     def occupancy(self, points: ArrayLike) -> Occupancy:
         """What these kernels say at points: the formulas of the server, in float64.
 
-        With mu = f(x) and s2 = sum_m var_m phi_m^2: mean = sigmoid(mu / sqrt(1 + pi s2 / 8)) and var = mean (1 - mean)
-        (1 - 1 / sqrt(1 + pi s2 / 8)). Where the summed activation stays below `observed_activation` the answer is 0.5, latent
+        With mu = f(x) and s2 = sum_m var_m phi_m^2 + residual_var max(0, 1 - sum_m phi_m):
+        mean = sigmoid(mu / sqrt(1 + pi s2 / 8)) and var = mean (1 - mean) (1 - 1 / sqrt(1 + pi s2 / 8)). Where the summed activation stays below `observed_activation` the answer is 0.5, latent
         mean 0 and latent variance `prior_var`, and `observed` is false. Kernels with an activation under 1e-19 are left out;
         memory is bounded whatever N and K are.
 
@@ -100,6 +101,7 @@ class KernelSet:
                     latent_mean[rows] += sums[:, 1]
                     latent_var[rows] += np.square(phi, out=phi) @ weight_var[columns]
         observed = activation >= self.observed_activation if k else np.zeros(n, np.bool_)
+        latent_var += self.residual_var * np.maximum(1.0 - activation, 0.0)
         latent_mean[~observed] = 0.0
         latent_var[~observed] = self.prior_var
         scale = 1.0 / np.sqrt(1.0 + (math.pi / 8.0) * latent_var)
@@ -124,6 +126,7 @@ class KernelSet:
                 potclient_kernels=np.int64(_FILE_VERSION),
                 observed_activation=np.float64(self.observed_activation),
                 prior_var=np.float64(self.prior_var),
+                residual_var=np.float64(self.residual_var),
                 map_revision=np.int64(self.map_revision),
                 **{name: getattr(self, name) for name in _SHAPES},
             )
@@ -146,6 +149,7 @@ class KernelSet:
                 return cls(
                     observed_activation=float(stored["observed_activation"]),
                     prior_var=float(stored["prior_var"]),
+                    residual_var=float(stored["residual_var"]),
                     map_revision=int(stored["map_revision"]),
                     **{
                         name: stored[name].astype(np.float64 if name == "hinge_mean" else np.float32)
@@ -168,6 +172,7 @@ class KernelSet:
             weight_var=encode_array(self.weight_var.astype(np.float32)),
             observed_activation=self.observed_activation,
             prior_var=self.prior_var,
+            residual_var=self.residual_var,
         )
 
     @classmethod
@@ -193,6 +198,7 @@ class KernelSet:
                 weight_var=array("weight_var", message.weight_var, (k,)),
                 observed_activation=message.observed_activation,
                 prior_var=message.prior_var,
+                residual_var=message.residual_var,
                 map_revision=map_revision,
             )
         except WireError as error:
@@ -208,7 +214,7 @@ class KernelSet:
         parts = list(sets)
         if not parts:
             raise UsageError("no kernel sets to join")
-        scalars = {(p.observed_activation, p.prior_var, p.map_revision) for p in parts}
+        scalars = {(p.observed_activation, p.prior_var, p.residual_var, p.map_revision) for p in parts}
         if len(scalars) > 1:
             raise UsageError(f"kernel sets of different maps or revisions: {sorted(scalars)}")
         arrays: dict[str, Any] = {name: np.concatenate([getattr(p, name) for p in parts]) for name in _SHAPES}

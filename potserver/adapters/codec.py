@@ -19,6 +19,7 @@ from potschemas.messages import DType, ErrorCode
 from potserver.adapters.limits import Limits
 from potserver.adapters.ports import Snapshot
 from potserver.domain.types import (
+    AnswerRule,
     Atom,
     Float64,
     KernelSet,
@@ -401,9 +402,7 @@ def refusal(error: PotserverError) -> messages.ReceiptStatus:
     return messages.ReceiptStatus.DROPPED if error.retryable else messages.ReceiptStatus.REJECTED
 
 
-def encode_params(
-    *, map_id: str, scan: Scan, update: MapUpdate, observed_activation: float, prior_var: float
-) -> Wire:
+def encode_params(*, map_id: str, scan: Scan, update: MapUpdate, rule: AnswerRule) -> Wire:
     """The transported parameters of one cloud."""
     return _wire(
         messages.Params(
@@ -412,9 +411,7 @@ def encode_params(
             seq=scan.seq,
             stamp_ns=scan.stamp_ns,
             map_revision=int(update.map_revision),
-            kernels=encode_kernels(
-                update.kernels, observed_activation=observed_activation, prior_var=prior_var
-            ),
+            kernels=encode_kernels(update.kernels, rule),
             sectors=_sectors(update.sectors),
         )
     )
@@ -457,7 +454,7 @@ def _sectors(matches: list[SectorMatch]) -> list[messages.SectorReport]:
 # --- out: maps and answers ----------------------------------------------------------------------------------
 
 
-def encode_kernels(kernels: KernelSet, *, observed_activation: float, prior_var: float) -> messages.Kernels:
+def encode_kernels(kernels: KernelSet, rule: AnswerRule) -> messages.Kernels:
     """Kernels for the wire: float64 positions become float32 offsets from their centroid, in whole metres."""
     origin = np.round(kernels.hinge_mean.mean(axis=0)) if len(kernels) else np.zeros(3)
     return messages.Kernels(
@@ -468,8 +465,9 @@ def encode_kernels(kernels: KernelSet, *, observed_activation: float, prior_var:
         gamma_rate=_float32(kernels.gamma_rate),
         weight_mean=_float32(kernels.weight_mean),
         weight_var=_float32(kernels.weight_var),
-        observed_activation=float(observed_activation),
-        prior_var=float(prior_var),
+        observed_activation=float(rule.observed_activation),
+        prior_var=float(rule.prior_var),
+        residual_var=float(rule.residual_var),
     )
 
 
@@ -508,8 +506,7 @@ def encode_params_part(
     n_parts: int,
     map_revision: int,
     kernels: KernelSet,
-    observed_activation: float,
-    prior_var: float,
+    rule: AnswerRule,
 ) -> Wire:
     """One part of the reply to `q/params`."""
     return _wire(
@@ -517,7 +514,7 @@ def encode_params_part(
             part=part,
             n_parts=n_parts,
             map_revision=map_revision,
-            kernels=encode_kernels(kernels, observed_activation=observed_activation, prior_var=prior_var),
+            kernels=encode_kernels(kernels, rule),
         )
     )
 
@@ -527,18 +524,14 @@ def encode_atom_list(atoms: Sequence[Atom], usage: Mapping[str, int]) -> Wire:
     return _wire(messages.AtomList(atoms=[_atom_info(atom, usage) for atom in atoms]))
 
 
-def encode_atom(
-    atom: Atom, usage: Mapping[str, int], *, observed_activation: float, prior_var: float
-) -> Wire:
+def encode_atom(atom: Atom, usage: Mapping[str, int], rule: AnswerRule) -> Wire:
     """One atom whole."""
     return _wire(
         messages.Atom(
             info=_atom_info(atom, usage),
             hit_points=_float32(atom.hit_points),
             free_points=_float32(atom.free_points),
-            kernels=encode_kernels(
-                atom.kernels, observed_activation=observed_activation, prior_var=prior_var
-            ),
+            kernels=encode_kernels(atom.kernels, rule),
         )
     )
 
@@ -574,8 +567,9 @@ def encode_info(
             lower=[float(c) for c in hinges.min(axis=0)] if len(hinges) else None,
             upper=[float(c) for c in hinges.max(axis=0)] if len(hinges) else None,
             tile_size_m=float(tile_size_m),
-            observed_activation=float(snapshot.observed_activation),
-            prior_var=float(snapshot.prior_var),
+            observed_activation=float(snapshot.rule.observed_activation),
+            prior_var=float(snapshot.rule.prior_var),
+            residual_var=float(snapshot.rule.residual_var),
             limits=messages.Limits(
                 max_cloud_bytes=limits.max_cloud_bytes,
                 max_cloud_points=limits.max_cloud_points,

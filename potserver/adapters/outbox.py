@@ -67,6 +67,7 @@ class Outbox:
         with self._changed:
             emptied = self._changed.wait_for(lambda: not (self._tasks or self._busy), timeout_s)
             self._closed = True
+            self._tasks.clear()  # nobody will send them
             self._changed.notify_all()
         self._thread.join(max(0.0, deadline - time.monotonic()))
         return emptied
@@ -75,6 +76,8 @@ class Outbox:
         return len(self._tasks) >= self._max_pending or self._n_bytes >= self._max_bytes
 
     def _append(self, task: Task, n_bytes: int) -> None:
+        if self._closed:
+            return
         self._tasks.append((task, n_bytes))
         self._n_bytes += n_bytes
         self._changed.notify_all()

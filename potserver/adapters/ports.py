@@ -8,7 +8,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from potserver.domain.types import Atom, KernelSet, MapUpdate, Occupancy, Scan
+from potserver.domain.types import AnswerRule, Atom, KernelSet, MapUpdate, Occupancy, Scan
 from potserver.services.settings import MappingSettings
 
 
@@ -27,9 +27,7 @@ class Snapshot(Protocol):
     @property
     def map_revision(self) -> int: ...
     @property
-    def observed_activation(self) -> float: ...
-    @property
-    def prior_var(self) -> float: ...
+    def rule(self) -> AnswerRule: ...
     def __len__(self) -> int: ...
 
 

@@ -188,8 +188,7 @@ class MapQueryable:
                 n_parts=len(parts),
                 map_revision=revision,
                 kernels=kernels,
-                observed_activation=snapshot.observed_activation,
-                prior_var=snapshot.prior_var,
+                rule=snapshot.rule,
             )
 
     def _atoms(self, payload: bytes, _arrived_s: float) -> Iterator[codec.Wire]:
@@ -202,8 +201,7 @@ class MapQueryable:
             yield codec.encode_atom(
                 dictionary.get(atom_id),
                 usage,
-                observed_activation=snapshot.observed_activation,
-                prior_var=snapshot.prior_var,
+                snapshot.rule,
             )
 
     def _info(self, payload: bytes, _arrived_s: float) -> Iterator[codec.Wire]:

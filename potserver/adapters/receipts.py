@@ -55,7 +55,7 @@ class ReceiptSender:
         stamp_ns = time.time_ns()
         map_id = self._keys.map_id
         snapshot = self._mapper.snapshot
-        activation, prior_var = snapshot.observed_activation, snapshot.prior_var
+        rule = snapshot.rule
         depth = self._intake.depth
 
         def receipt(with_kernels: bool) -> codec.Wire:
@@ -63,20 +63,14 @@ class ReceiptSender:
                 map_id=map_id,
                 scan=scan,
                 update=update,
-                kernels=codec.encode_kernels(
-                    update.kernels, observed_activation=activation, prior_var=prior_var
-                )
-                if with_kernels
-                else None,
+                kernels=codec.encode_kernels(update.kernels, rule) if with_kernels else None,
                 queue_depth=depth,
                 wait_ms=wait_ms,
                 integrate_ms=integrate_ms,
             )
 
         def publish_params() -> None:
-            wire = codec.encode_params(
-                map_id=map_id, scan=scan, update=update, observed_activation=activation, prior_var=prior_var
-            )
+            wire = codec.encode_params(map_id=map_id, scan=scan, update=update, rule=rule)
             self._put(self._keys.params(scan.robot_id), wire, zenoh.Priority.DATA)
             self._health.count("params.sent")
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from potserver.domain.types import Float64, KernelSet, Occupancy
+from potserver.domain.types import AnswerRule, Float64, KernelSet, Occupancy
 from potserver.errors import BadPointsError, ShapeError
 from potserver.numerics import kernel_index
 from potserver.numerics.occupancy import predict_occupancy
@@ -45,9 +45,7 @@ class KernelMap:
             tau: Support cut, if it was measured on a similar map before; see `numerics.kernel_index`.
         """
         self.kernels = kernels
-        self.observed_activation = observed_activation
-        self.prior_var = prior_var
-        self.residual_var = residual_var
+        self.rule = AnswerRule(observed_activation, prior_var, residual_var)
         self.map_revision = map_revision
         self._threads = threads or default_threads()
         self._index = kernel_index.build_index(
@@ -123,17 +121,19 @@ class KernelMap:
             Gaussian processes (Snelson and Ghahramani 2006), in the kernels' own measure.
         """
         sums = self.latent(as_points(points))
-        observed = sums.activation >= self.observed_activation
+        observed = sums.activation >= self.rule.observed_activation
         latent_mean = np.where(observed, sums.mean, np.float32(0))
         unexplained = np.maximum(np.float32(1) - sums.activation, np.float32(0))
         latent_var = np.where(
-            observed, sums.var + np.float32(self.residual_var) * unexplained, np.float32(self.prior_var)
+            observed,
+            sums.var + np.float32(self.rule.residual_var) * unexplained,
+            np.float32(self.rule.prior_var),
         )
         # float64: in float32 a sure answer would round to exactly 1 and cost an infinite log-loss when wrong
         mean, var = predict_occupancy(latent_mean.astype(np.float64), latent_var.astype(np.float64))
         return Occupancy(
-            mean=mean,
-            var=var,
+            mean=np.asarray(mean, np.float64),
+            var=np.asarray(var, np.float64),
             latent_mean=latent_mean,
             latent_var=latent_var,
             observed=observed,

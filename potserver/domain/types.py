@@ -64,6 +64,8 @@ def check_rigid(transform: Float64, tolerance: float = 1e-3) -> None:
     if not np.allclose(transform[3], (0.0, 0.0, 0.0, 1.0), atol=1e-9):
         raise BadPoseError(f"the pose's last row is {transform[3].tolist()}, need 0 0 0 1")
     rotation = transform[:3, :3]
+    if np.abs(rotation).max() > 1.0 + tolerance:
+        raise BadPoseError("the pose is not rigid: its rotation part has entries beyond 1")
     defect = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
     if defect > tolerance or np.linalg.det(rotation) < 0:
         raise BadPoseError(
@@ -153,7 +155,7 @@ class Atom:
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Sector:
-    """A pie slice of one scan (a cylindrical sector in 3D). Points in the sector frame: sensor origin, levelled, x along the bisector."""
+    """A pie slice of one scan (a cylindrical sector in 3D); its frame: origin at the sensor, levelled, x along the bisector."""
 
     azimuth_min_rad: float  # about the sensor, in the levelled sensor frame
     azimuth_max_rad: float
@@ -183,6 +185,14 @@ class SectorMatch(NamedTuple):
     marginal_error: float
     n_iterations: int
     reason: str | None = None
+
+
+class AnswerRule(NamedTuple):
+    """What turns sums over kernels into answers; it travels with every set of kernels, so that all who have them agree."""
+
+    observed_activation: float  # a point with less summed activation is unobserved
+    prior_var: float  # log-odds^2, latent variance of unobserved points
+    residual_var: float  # log-odds^2, added in the measure that the activation falls short of 1
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False, kw_only=True)

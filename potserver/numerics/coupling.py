@@ -186,7 +186,7 @@ def _check_reg(reg: float) -> None:
 @nb.njit(nogil=True, fastmath=FAST, error_model="numpy", cache=True)
 def _solve_pairs(
     xs, x_offsets, ys, y_offsets, pairs, start, stride, reg, relative, tol, max_iter, cost, error, its, ok
-):  # type: ignore[no-untyped-def]
+):
     n_max = 0
     m_max = 0
     for p in range(start, len(pairs), stride):
@@ -209,7 +209,7 @@ def _solve_pairs(
 
 
 @nb.njit(nogil=True, fastmath=FAST, error_model="numpy", cache=True)
-def _squared_distances(x, y, i, row):  # type: ignore[no-untyped-def]
+def _squared_distances(x, y, i, row):
     """Row i of D, exactly: no |x|^2 + |y|^2 - 2 x.y, which cancels."""
     x0, x1, x2 = x[i, 0], x[i, 1], x[i, 2]
     for j in range(len(y)):
@@ -220,7 +220,7 @@ def _squared_distances(x, y, i, row):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(nogil=True, fastmath=FAST, error_model="numpy", cache=True)
-def _start_potentials(x, y, f, g, row):  # type: ignore[no-untyped-def]
+def _start_potentials(x, y, f, g, row):
     """f = row minima of D, then g = column minima of D - f: every row and column of exp((f + g - D)/eps) then holds a 1.
 
     Returns the largest cost.
@@ -241,7 +241,7 @@ def _start_potentials(x, y, f, g, row):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(nogil=True, fastmath=FAST, error_model="numpy", cache=True)
-def _gibbs(x, y, f, g, inv_eps, kernel):  # type: ignore[no-untyped-def]
+def _gibbs(x, y, f, g, inv_eps, kernel):
     n, m = kernel.shape
     for i in range(n):
         row = kernel[i]
@@ -252,7 +252,7 @@ def _gibbs(x, y, f, g, inv_eps, kernel):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(nogil=True, fastmath=FAST, error_model="numpy", cache=True)
-def _iterate(kernel, u, v, t, omega):  # type: ignore[no-untyped-def]
+def _iterate(kernel, u, v, t, omega):
     """One relaxed scaling iteration in one pass over K; returns the L1 marginal errors before it and the largest scaling."""
     n, m = kernel.shape
     a = np.float32(1.0) / np.float32(n)
@@ -284,7 +284,7 @@ def _iterate(kernel, u, v, t, omega):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(nogil=True, error_model="numpy", cache=True)
-def _absorb(u, v, f, g, eps):  # type: ignore[no-untyped-def]
+def _absorb(u, v, f, g, eps):
     for i in range(len(u)):
         f[i] += eps * np.log(u[i])
         u[i] = np.float32(1)
@@ -294,7 +294,7 @@ def _absorb(u, v, f, g, eps):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(nogil=True, error_model="numpy", cache=True)
-def _sinkhorn(x, y, reg, relative, tol, max_iter, kernel, f, g, u, v, t):  # type: ignore[no-untyped-def]
+def _sinkhorn(x, y, reg, relative, tol, max_iter, kernel, f, g, u, v, t):
     """Solve one problem in the given workspace; on return P_ij = K_ij u_i v_j / (n m)."""
     n, m = len(x), len(y)
     largest = _start_potentials(x, y, f, g, t)

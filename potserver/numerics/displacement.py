@@ -88,7 +88,7 @@ def affine_map(source: Float64, images: Float64, ridge: float) -> tuple[Float64,
 
 
 @nb.njit(nogil=True, error_model="numpy", cache=True)
-def _nearest(points, source):  # type: ignore[no-untyped-def]
+def _nearest(points, source):
     out = np.empty(len(points), np.int64)
     for k in range(len(points)):
         best = np.inf
@@ -104,7 +104,7 @@ def _nearest(points, source):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(nogil=True, error_model="numpy", cache=True)
-def _entropic(points, target, potential, reg):  # type: ignore[no-untyped-def]
+def _entropic(points, target, potential, reg):
     out = np.empty((len(points), 3))
     exponent = np.empty(len(target))
     for k in range(len(points)):

@@ -38,8 +38,8 @@ def wrap_angle(angle_rad: NDArray[np.floating]) -> NDArray[np.floating]:
 
 def sector_edges(n_sectors: int) -> Float64:
     """(n_sectors + 1,) rad: equal cylindrical sectors about the sensor, the first one centred on its heading."""
-    width = 2.0 * np.pi / n_sectors
-    return -width / 2.0 + width * np.arange(n_sectors + 1)
+    width = 2.0 * math.pi / n_sectors
+    return np.asarray(-width / 2.0 + width * np.arange(n_sectors + 1), np.float64)
 
 
 def in_sector(

@@ -3,8 +3,8 @@
     latent mean  sum_m w_m phi_m(x),   latent variance  sum_m v_m phi_m(x)^2,   activation  sum_m phi_m(x)
     phi_m(x) = exp(-gamma_m |x - h_m|^2)                                                        (paper eq. 1)
 
-A kernel's reach is where what it adds falls below a cut tau, which depends on its gamma, weight *and* variance. tau is chosen by
-measuring: at sample points, the absolute sum of everything cut must change the probability by less than a budget. Kernels are
+A kernel's reach is where what it adds falls below a cut tau, which depends on its gamma, weight *and* variance. tau is
+chosen by measuring: at sample points, the absolute sum of everything cut must change the probability by less than a budget. Kernels are
 sorted into levels by reach (a factor of two each), every level into its own grid of cells, so wide and narrow ones cost alike.
 Queries are sorted into cubes; the kernels that reach a cube are gathered once, relative to its centre (so large coordinates
 lose nothing in float32), and a dense SIMD loop runs over queries times gathered kernels.
@@ -249,7 +249,7 @@ def sparse_features(
     grouped = points[order]
 
     def run(span: tuple[int, int]) -> tuple[Int64, NDArray[np.int32], Float32]:
-        return _feature_rows(  # type: ignore[no-any-return]
+        return _feature_rows(
             grouped, cuts[span[0] : span[1] + 1], index.hinge, index.columns, index.order, index.level_start,
             index.level_edge, index.level_cell, index.level_size, index.keys, np.float32(cut),
         )  # fmt: skip
@@ -265,7 +265,7 @@ def sparse_features(
 
 
 @nb.njit(nogil=True, error_model="numpy", cache=True)
-def _cut_sums(points, hinge, gamma, weight, variance, taus):  # type: ignore[no-untyped-def]
+def _cut_sums(points, hinge, gamma, weight, variance, taus):
     """Float64: for each sample and each tau, the sums that a cut at tau leaves out; and the whole variance."""
     n, k, n_taus = len(points), len(hinge), len(taus)
     cut_mean = np.zeros((n, n_taus))
@@ -292,7 +292,7 @@ def _cut_sums(points, hinge, gamma, weight, variance, taus):  # type: ignore[no-
 
 
 @nb.njit(nogil=True, error_model="numpy", cache=True)
-def _lower_bound(keys, low, high, key):  # type: ignore[no-untyped-def]
+def _lower_bound(keys, low, high, key):
     while low < high:
         middle = (low + high) >> 1
         if keys[middle] < key:
@@ -305,7 +305,7 @@ def _lower_bound(keys, low, high, key):  # type: ignore[no-untyped-def]
 @nb.njit(nogil=True, error_model="numpy", cache=True)
 def _gather(
     box_lower, box_upper, hinge, columns, level_start, level_edge, level_cell, level_size, keys, found
-):  # type: ignore[no-untyped-def]
+):
     """Numbers (in index order) of the kernels that reach the box; returns how many, and the buffer, grown if need be."""
     n = 0
     for level in range(len(level_edge)):
@@ -345,7 +345,7 @@ def _gather(
 
 
 @nb.njit(nogil=True, fastmath=FAST, error_model="numpy", cache=True)
-def _sum_point(x, y, z, hx, hy, hz, minus_gamma, w, v, n):  # type: ignore[no-untyped-def]
+def _sum_point(x, y, z, hx, hy, hz, minus_gamma, w, v, n):
     mean = np.float32(0)
     var = np.float32(0)
     activation = np.float32(0)
@@ -361,7 +361,7 @@ def _sum_point(x, y, z, hx, hy, hz, minus_gamma, w, v, n):  # type: ignore[no-un
 
 
 @nb.njit(nogil=True, error_model="numpy", cache=True)
-def _box(points, a, b, lower, upper):  # type: ignore[no-untyped-def]
+def _box(points, a, b, lower, upper):
     for c in range(3):
         lower[c] = points[a, c]
         upper[c] = points[a, c]
@@ -371,7 +371,7 @@ def _box(points, a, b, lower, upper):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(nogil=True, error_model="numpy", cache=True)
-def _sum_cubes(points, cuts, hinge, columns, level_start, level_edge, level_cell, level_size, keys, sums):  # type: ignore[no-untyped-def]
+def _sum_cubes(points, cuts, hinge, columns, level_start, level_edge, level_cell, level_size, keys, sums):
     found = np.empty(4096, np.int64)
     local = np.empty((6, 4096), np.float32)
     lower = np.empty(3)
@@ -405,7 +405,7 @@ def _sum_cubes(points, cuts, hinge, columns, level_start, level_edge, level_cell
 @nb.njit(nogil=True, error_model="numpy", cache=True)
 def _feature_rows(
     points, cuts, hinge, columns, order, level_start, level_edge, level_cell, level_size, keys, cut
-):  # type: ignore[no-untyped-def]
+):
     first, last = cuts[0], cuts[-1]
     counts = np.zeros(last - first, np.int64)
     capacity = 32 * (last - first) + 1024

@@ -108,7 +108,7 @@ def fit_sparse(
             (count * loss).sum() + 0.5 * (precision * np.square(w - prior_mean, dtype=np.float64)).sum()
         )
 
-    # far from the data's answer the curvature vanishes and Newton crawls: start from the prior or from zero, whichever is nearer
+    # far from the optimum the curvature vanishes and Newton crawls: start from the prior or from zero, whichever is nearer
     w = prior_mean.astype(np.float32).copy()
     f = base + latent(w)
     value = objective(f, w)
@@ -132,11 +132,11 @@ def fit_sparse(
         # inexact Newton: far from the optimum a rough step is as good as an exact one
         forcing = min(0.1, math.sqrt(norm / start_norm))
         step, used = _conjugate_gradient(
-            lambda d: curvature_times(d, curvature),
+            lambda d, curvature=curvature: curvature_times(d, curvature),
             -gradient,
             diagonal,
             forcing,
-            max_conjugate_gradient,  # noqa: B023
+            max_conjugate_gradient,
         )
         n_newton += 1
         n_cg += used
@@ -168,7 +168,7 @@ def fit_sparse(
 
 def _conjugate_gradient(
     apply, rhs: Float32, diagonal: Float32, forcing: float, max_steps: int
-) -> tuple[Float32, int]:  # type: ignore[no-untyped-def]
+) -> tuple[Float32, int]:
     """Solve A x = rhs with a Jacobi preconditioner until the residual has shrunk by `forcing`."""
     x = np.zeros_like(rhs)
     r = rhs.copy()
@@ -191,7 +191,7 @@ def _conjugate_gradient(
 
 
 @nb.njit(nogil=True, fastmath=FAST, error_model="numpy", cache=True)
-def _rows_dot(indptr, indices, values, w, first, last, out):  # type: ignore[no-untyped-def]
+def _rows_dot(indptr, indices, values, w, first, last, out):
     for i in range(first, last):
         s = np.float32(0)
         for e in range(indptr[i], indptr[i + 1]):
@@ -200,7 +200,7 @@ def _rows_dot(indptr, indices, values, w, first, last, out):  # type: ignore[no-
 
 
 @nb.njit(nogil=True, fastmath=FAST, error_model="numpy", cache=True)
-def _rows_scatter(indptr, indices, values, vector, first, last, k, square):  # type: ignore[no-untyped-def]
+def _rows_scatter(indptr, indices, values, vector, first, last, k, square):
     out = np.zeros(k, np.float32)
     for i in range(first, last):
         c = vector[i]
@@ -211,7 +211,7 @@ def _rows_scatter(indptr, indices, values, vector, first, last, k, square):  # t
 
 
 @nb.njit(nogil=True, fastmath=FAST, error_model="numpy", cache=True)
-def _rows_normal(indptr, indices, values, curvature, direction, first, last):  # type: ignore[no-untyped-def]
+def _rows_normal(indptr, indices, values, curvature, direction, first, last):
     """Phi^T diag(curvature) Phi direction over some rows, in one pass."""
     out = np.zeros(len(direction), np.float32)
     for i in range(first, last):

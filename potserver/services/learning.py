@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 
 import numpy as np
 
@@ -53,7 +54,7 @@ def learn_atoms(
     heading = yaw_of(scan.T_map_sensor)
     edges = sector_edges(settings.n_sectors)
     atoms = []
-    for number, (low, high) in enumerate(zip(edges[:-1], edges[1:], strict=True)):
+    for number, (low, high) in enumerate(itertools.pairwise(edges)):
         members = in_sector(labelled.points, heading + low, heading + high, settings.max_range_m)
         points = labelled.points[members] @ rotation_z(heading + (low + high) / 2.0)
         occupied = labelled.occupied[members]

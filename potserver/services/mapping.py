@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import time
 from collections import Counter
 from collections.abc import Iterator
@@ -159,7 +160,7 @@ class MappingService:
         radius = self.settings.max_range_m
         edges = sector_edges(self.settings.n_sectors)
         sectors = []
-        for low, high in zip(edges[:-1], edges[1:], strict=True):
+        for low, high in itertools.pairwise(edges):
             members = in_sector(labelled.points, heading + low, heading + high, radius)
             turn = heading + (low + high) / 2.0 if self.settings.align_sectors else 0.0
             rotation = rotation_z(turn)
@@ -174,7 +175,7 @@ class MappingService:
                     hit_points=local[members & labelled.occupied],
                     free_points=local[members & ~labelled.occupied],
                     T_map_sector=T,
-                )  # fmt: skip
+                )
             )
         return sectors
 

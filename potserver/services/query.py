@@ -87,10 +87,14 @@ class QueryService:
         if (high < low).any():
             raise BadPointsError(f"the box is inverted: lower {low.tolist()}, upper {high.tolist()}")
         # half a millionth of slack, so that a box of 10 m at 0.1 m has 100 cells and not 101
-        counts = np.maximum(np.ceil((high - low) / resolution - 5e-7), 1.0)
-        if float(np.prod(counts)) > self.max_grid_cells:
+        with np.errstate(
+            over="ignore"
+        ):  # a tiny resolution gives infinitely many cells, which is over the limit
+            counts = np.maximum(np.ceil((high - low) / resolution - 5e-7), 1.0)
+            n_cells = float(np.prod(counts))
+        if n_cells > self.max_grid_cells:
             raise TooLargeError(
-                f"{np.prod(counts):.3g} cells, the limit is {self.max_grid_cells}; ask for a coarser or smaller grid"
+                f"{n_cells:.3g} cells, the limit is {self.max_grid_cells}; ask for a coarser or smaller grid"
             )
         nx, ny, nz = (int(c) for c in counts)
         return GridPlan(self._mapping.snapshot, low, float(resolution), (nx, ny, nz), part_cells)

@@ -18,8 +18,8 @@ _GAMMA_SHAPE = 100.0  # a placed kernel's width is known to 10 %
 
 
 def gamma_of_spacing(spacing_m: float) -> float:
-    """1/m^2: the width at which kernels of this spacing overlap smoothly, a length-scale of 0.75 spacings."""
-    return 0.5 / (0.75 * spacing_m) ** 2
+    """1/m^2: the width at which kernels of this spacing overlap smoothly, a length-scale of 0.6 spacings."""
+    return 0.5 / (0.6 * spacing_m) ** 2
 
 
 def place_kernels(points: Float64, spacing_m: float, prior_var: float) -> KernelSet:

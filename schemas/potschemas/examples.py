@@ -292,6 +292,7 @@ def _kernels(k: int, origin: list[float] | None = None) -> m.Kernels:
         weight_var=_f4(np.full(k, 0.5)),
         observed_activation=0.125,
         prior_var=64.0,
+        residual_var=32.0,
     )
 
 
@@ -311,6 +312,7 @@ def _info(limits: m.Limits, *, lower: list[float] | None, upper: list[float] | N
         tile_size_m=8.0,
         observed_activation=0.125,
         prior_var=64.0,
+        residual_var=32.0,
         limits=limits,
         started_ns=_STAMP_NS,
     )

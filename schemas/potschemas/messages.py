@@ -13,6 +13,7 @@ anything else (a new required field, another meaning, a new enum value) needs a 
 from __future__ import annotations
 
 import sys
+from contextlib import suppress
 from enum import Enum
 from typing import Annotated, ClassVar
 
@@ -100,7 +101,8 @@ class Kernels(Message, frozen=True, kw_only=True):
     """K kernels in the map frame, ten numbers each, and the scalars that turn them into answers.
 
     f(x) = sum_m w_m exp(-gamma_m |x - h_m|^2), gamma_m = gamma_shape_m / gamma_rate_m. A point whose summed
-    activation is below `observed_activation` is unobserved: 0.5, with latent variance `prior_var`.
+    activation is below `observed_activation` is unobserved: 0.5, with latent variance `prior_var`. Elsewhere the
+    latent variance is sum_m weight_var_m phi_m^2 + residual_var * max(0, 1 - sum_m phi_m).
     """
 
     schema: ClassVar[str] = "pot.kernels.v1"
@@ -114,6 +116,7 @@ class Kernels(Message, frozen=True, kw_only=True):
     weight_var: Array  # (K,) float32, log-odds^2
     observed_activation: Finite  # summed activation below which a point is unobserved
     prior_var: Finite  # log-odds^2, of the latent where nothing was observed
+    residual_var: Finite  # log-odds^2, added in the measure that the summed activation falls short of 1
 
 
 class SectorReport(msgspec.Struct, frozen=True, kw_only=True):
@@ -340,6 +343,7 @@ class Info(Message, frozen=True, kw_only=True):
     tile_size_m: Positive  # m, edge of a tile
     observed_activation: Finite  # summed activation below which a point is unobserved
     prior_var: Finite  # log-odds^2, of the latent where nothing was observed
+    residual_var: Finite  # log-odds^2, added in the measure that the summed activation falls short of 1
     limits: Limits  # what the server accepts
     started_ns: Sequence  # when the server started
 
@@ -453,3 +457,9 @@ ALL_MESSAGES: tuple[type[Message], ...] = (
     ControlReply,
     ErrorReply,
 )
+
+for _kind in ALL_MESSAGES:
+    # msgspec builds what it knows of a type at its first use, and crashes when two threads use it first at once
+    with suppress(msgspec.ValidationError):
+        msgspec.convert({}, _kind)
+del _kind

@@ -19,7 +19,7 @@ from potschemas import messages, wire
 from potschemas.keys import MapKeys, stats_key
 from potserver.config import Settings, load_settings
 from potserver.domain.dictionary import AtomDictionary
-from potserver.domain.types import KernelSet, MapUpdate, Occupancy, Scan, TileChange
+from potserver.domain.types import AnswerRule, KernelSet, MapUpdate, Occupancy, Scan, TileChange
 from potserver.server import MapServer
 from potserver.services.query import QueryService
 from potserver.services.settings import MappingSettings
@@ -169,8 +169,7 @@ def points_query(points: Any, **changes: Any) -> messages.PointsQuery:
 
 
 class FakeSnapshot:
-    observed_activation = 0.05
-    prior_var = 50.0
+    rule = AnswerRule(observed_activation=0.05, prior_var=50.0, residual_var=50.0)
 
     def __init__(self, owner: FakeMapper, kernels: KernelSet, map_revision: int) -> None:
         self._owner, self.kernels, self.map_revision = owner, kernels, map_revision

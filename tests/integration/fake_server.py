@@ -51,6 +51,7 @@ def kernels_of(points: np.ndarray[Any, Any], revision: int) -> KernelSet:
         weight_var=0.5 * one,
         observed_activation=0.05,
         prior_var=50.0,
+        residual_var=20.0,
         map_revision=revision,
     )
 
@@ -386,6 +387,7 @@ class FakeServer:
                 tile_size_m=8.0,
                 observed_activation=0.05,
                 prior_var=50.0,
+                residual_var=20.0,
                 limits=LIMITS,
                 started_ns=1,
             )

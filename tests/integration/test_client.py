@@ -532,6 +532,31 @@ client.info()
     assert done.returncode == status, done.stderr
 
 
+def test_first_messages_may_come_on_many_threads_at_once() -> None:
+    program = """
+import sys, threading
+from potclient.client import _decode
+from potschemas import messages
+from potschemas.wire import encode
+import zenoh
+sys.setswitchinterval(1e-6)
+payload = zenoh.ZBytes(encode(messages.Receipt(map="m", robot="r", seq=1, status=messages.ReceiptStatus.ACCEPTED)))
+start = threading.Barrier(24)
+def first():
+    start.wait()
+    _decode(payload, messages.Receipt)
+threads = [threading.Thread(target=first) for _ in range(24)]
+for t in threads: t.start()
+for t in threads: t.join()
+"""
+    for _ in range(3):
+        done = subprocess.run(
+            [sys.executable, "-c", program], timeout=LIMIT_S * 2, capture_output=True, text=True, check=False
+        )
+        assert done.returncode == 0, done.stderr
+        assert not done.stderr
+
+
 def test_the_client_imports_nothing_heavy() -> None:
     program = """
 import sys, potclient, potclient.cli, potclient.loadtest, potclient.play

@@ -5,6 +5,7 @@ from __future__ import annotations
 import collections
 import json
 import queue
+import signal
 import subprocess
 import sys
 import threading
@@ -604,8 +605,44 @@ def test_a_client_killed_in_the_middle_of_a_query_does_no_harm(make_rig: MakeRig
     assert rig.server.stop() is True
 
 
-def test_a_robot_that_stops_reading_does_not_stop_the_mapper(make_rig: MakeRig) -> None:
-    """Its receipts block an outbox, for as long as Zenoh lets them; the writer goes on."""
+def test_a_frozen_subscriber_stops_neither_the_mapper_nor_the_receipts_of_others(make_rig: MakeRig) -> None:
+    rig = make_rig(zenoh__shared_memory=False)
+    client = rig.client()
+    script = (
+        "import json, sys, threading, zenoh\n"
+        "c = zenoh.Config()\n"
+        "for k, v in json.loads(sys.argv[1]).items(): c.insert_json5(k, json.dumps(v))\n"
+        "s = zenoh.open(c)\n"
+        "s.declare_subscriber(sys.argv[2], lambda _: None)\n"
+        "list(s.get(sys.argv[3], timeout=30))\n"
+        "print('up', flush=True)\n"
+        "threading.Event().wait(100)\n"
+    )
+    config = {
+        "mode": "client",
+        "connect/endpoints": [rig.server.endpoint],
+        "scouting/multicast/enabled": False,
+    }
+    arguments = [json.dumps(config), client.keys.params("*"), client.keys.query("info")]
+    frozen = subprocess.Popen([sys.executable, "-c", script, *arguments], stdout=subprocess.PIPE)
+    try:
+        assert frozen.stdout is not None
+        frozen.stdout.readline()
+        frozen.send_signal(signal.SIGSTOP)
+        receipts = client.receipts("r1")
+        points = wire.encode_array(np.random.default_rng(0).normal(size=(50_000, 3)).astype(np.float32))
+        for seq in range(60):  # 24 MB of parameters: more than the sockets between us can hold
+            client.put_cloud(make_cloud(seq=seq, points=points))
+            assert receipts.get(timeout=4.0).seq == seq, "sooner than Zenoh gives the frozen one up"
+        assert rig.mapper.n_scans == 60
+    finally:
+        frozen.kill()
+        frozen.wait(DEADLINE_S)
+        frozen.stdout.close()  # type: ignore[union-attr]
+
+
+def test_a_full_outbox_does_not_stop_the_mapper(make_rig: MakeRig) -> None:
+    """Parameters that find it full are dropped and counted; the writer goes on."""
     rig = make_rig()
     client = rig.client()
     node = rig.server._nodes["default"]

@@ -34,6 +34,7 @@ def kernels(k: int = 50, seed: int = 0, *, offset_m: float = 0.0, revision: int 
         weight_var=f32(0.1, 3, k),
         observed_activation=0.05,
         prior_var=40.0,
+        residual_var=20.0,
         map_revision=revision,
     )
 
@@ -51,6 +52,7 @@ def slow_answer(
         mu += float(ks.weight_mean[m]) * phi
         s2 += float(ks.weight_var[m]) * phi * phi
         activation += phi
+    s2 += ks.residual_var * max(0.0, 1.0 - activation)
     observed = activation >= ks.observed_activation
     if not observed:
         mu, s2 = 0.0, ks.prior_var
@@ -135,6 +137,7 @@ def test_a_set_whose_arrays_disagree_is_refused() -> None:
                 "weight_mean": np.zeros(3, np.float32),
                 "observed_activation": 0.1,
                 "prior_var": 1.0,
+                "residual_var": 1.0,
             }
         )
 
@@ -147,7 +150,12 @@ def test_saved_kernels_come_back(tmp_path: Path) -> None:
     for name in ("hinge_mean", "hinge_var", "gamma_shape", "gamma_rate", "weight_mean", "weight_var"):
         np.testing.assert_array_equal(getattr(back, name), getattr(ks, name))
         assert getattr(back, name).dtype == getattr(ks, name).dtype
-    assert (back.observed_activation, back.prior_var, back.map_revision) == (0.05, 40.0, 3)
+    assert (back.observed_activation, back.prior_var, back.residual_var, back.map_revision) == (
+        0.05,
+        40.0,
+        20.0,
+        3,
+    )
 
 
 @pytest.mark.parametrize("content", [b"", b"PK\x03\x04 truncated", b"hello"])

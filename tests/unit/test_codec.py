@@ -16,9 +16,10 @@ from potschemas.messages import DType, ErrorCode, ReceiptStatus
 from potserver import errors
 from potserver.adapters import codec
 from potserver.adapters.limits import Limits
-from potserver.domain.types import KernelSet, MapUpdate, Occupancy, Scan, SectorMatch, TileChange
+from potserver.domain.types import AnswerRule, KernelSet, MapUpdate, Occupancy, Scan, SectorMatch, TileChange
 from potserver.errors import PotserverError, error_classes
 
+RULE = AnswerRule(observed_activation=0.05, prior_var=50.0, residual_var=20.0)
 LIMITS = Limits(max_cloud_bytes=10_000, max_cloud_points=100, max_query_points=50, max_coordinate_m=1000.0)
 
 
@@ -276,7 +277,7 @@ def test_points_queries_are_bounded() -> None:
 @pytest.mark.parametrize("at", [0.0, 5.3e6])
 def test_kernels_travel_as_float32_about_a_float64_origin(at: float) -> None:
     sent = kernels(50, at=at)
-    received = codec.encode_kernels(sent, observed_activation=0.05, prior_var=50.0)
+    received = codec.encode_kernels(sent, RULE)
     assert received.origin == np.round(sent.hinge_mean.mean(axis=0)).tolist()
     hinges = np.asarray(received.origin) + array(received.hinge_mean)
     np.testing.assert_allclose(hinges, sent.hinge_mean, atol=2e-6, rtol=0)
@@ -285,7 +286,7 @@ def test_kernels_travel_as_float32_about_a_float64_origin(at: float) -> None:
 
 
 def test_no_kernels_are_a_message_too() -> None:
-    received = codec.encode_kernels(KernelSet.empty(), observed_activation=0.05, prior_var=50.0)
+    received = codec.encode_kernels(KernelSet.empty(), RULE)
     assert received.origin == [0.0, 0.0, 0.0]
     assert received.hinge_mean.shape == [0, 3]
 
@@ -326,7 +327,7 @@ def test_a_sector_without_an_atom_still_travels() -> None:
         timings_ms={},
     )
     scan = decode(cloud())
-    sent = codec.encode_params(map_id="m", scan=scan, update=update, observed_activation=0.05, prior_var=50.0)
+    sent = codec.encode_params(map_id="m", scan=scan, update=update, rule=RULE)
     (report,) = wire.decode(sent.payload, messages.Params).sectors
     assert (report.atom_id, report.reason, report.n_hits) == (None, "no atom is comparable", 3)
     tick = codec.encode_revision(map_id="m", update=update, stamp_ns=9)

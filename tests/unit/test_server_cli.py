@@ -26,7 +26,7 @@ def no_variables(monkeypatch: pytest.MonkeyPatch) -> None:
             monkeypatch.delenv(name)
 
 
-@pytest.fixture
+@pytest.fixture(autouse=True)
 def keep_logging() -> Iterator[None]:
     root, ours = logging.getLogger(), logging.getLogger("potserver")
     before = root.handlers[:], root.level, ours.level
@@ -92,6 +92,7 @@ def test_variables_are_read(capsys: pytest.CaptureFixture[str], monkeypatch: pyt
         (["config", "show", "--settings", "/no/such.toml"], "cannot read settings file"),
         (["config", "show", "--root", "**"], "chunks"),
         (["atoms", "info", "/no/such.npz"], "no atom dictionary at"),
+        (["atoms", "build", "-o", "x.npz"], "recordings to learn from"),
         (["serve", "--map", "A"], "is not an id"),
     ],
 )
@@ -107,7 +108,7 @@ def test_a_mistake_is_one_line_and_exit_code_two(
 
 
 @pytest.mark.parametrize(
-    "words", [[], ["serve"], ["config"], ["config", "show"], ["atoms"], ["atoms", "info"]]
+    "words", [[], ["serve"], ["config"], ["config", "show"], ["atoms"], ["atoms", "info"], ["atoms", "build"]]
 )
 def test_help_is_there_at_every_level(capsys: pytest.CaptureFixture[str], words: list[str]) -> None:
     with pytest.raises(SystemExit) as caught:
@@ -156,7 +157,6 @@ def test_the_first_signal_sets_a_flag_and_handlers_are_put_back() -> None:
 # --- the log ------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.usefixtures("keep_logging")
 def test_events_are_json_lines_with_their_fields() -> None:
     stream = io.StringIO()
     configure_logging("info", "auto", stream)  # not a terminal
@@ -175,7 +175,6 @@ def test_events_are_json_lines_with_their_fields() -> None:
     assert foreign["event"] == "callback error"
 
 
-@pytest.mark.usefixtures("keep_logging")
 def test_on_a_console_they_are_for_people() -> None:
     stream = io.StringIO()
     configure_logging("debug", "console", stream)

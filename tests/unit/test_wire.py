@@ -338,6 +338,7 @@ def test_a_grids_own_shape_is_not_an_array() -> None:
     [
         ("pot.kernels.v1", ["observed_activation"]),
         ("pot.kernels.v1", ["prior_var"]),
+        ("pot.kernels.v1", ["residual_var"]),
         ("pot.kernels.v1", ["origin", 1]),
         ("pot.receipt.v1", ["wait_ms"]),
         ("pot.receipt.v1", ["sectors", 0, "azimuth_min_rad"]),
