@@ -71,8 +71,9 @@ class KernelSet:
         """What these kernels say at points: the formulas of the server, in float64.
 
         With mu = f(x) and s2 = sum_m var_m phi_m^2 + residual_var max(0, 1 - sum_m phi_m):
-        mean = sigmoid(mu / sqrt(1 + pi s2 / 8)) and var = mean (1 - mean) (1 - 1 / sqrt(1 + pi s2 / 8)). Where the summed activation stays below `observed_activation` the answer is 0.5, latent
-        mean 0 and latent variance `prior_var`, and `observed` is false. Kernels with an activation under 1e-19 are left out;
+        mean = sigmoid(mu / sqrt(1 + pi s2 / 8)) and var = mean (1 - mean) (1 - 1 / sqrt(1 + pi s2 / 8)). Where the summed
+        activation stays below `observed_activation` the answer is 0.5, latent mean 0 and latent variance `prior_var`, and
+        `observed` is false. Kernels with an activation under 1e-19 are left out;
         memory is bounded whatever N and K are.
 
         Args:

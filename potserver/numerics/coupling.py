@@ -26,7 +26,7 @@ Int64 = NDArray[np.int64]
 
 _CHECK_EVERY = 5
 _PLAIN_ITERATIONS = 15  # at the final level, before the contraction is measured
-_SWEEPS_PER_LEVEL = 6
+_SWEEPS_PER_LEVEL = 4
 _ABSORB_ABOVE = np.float32(1e12)
 
 
@@ -209,13 +209,12 @@ def _solve_pairs(
 
 
 @nb.njit(nogil=True, fastmath=FAST, error_model="numpy", cache=True)
-def _squared_distances(x, y, i, row):
-    """Row i of D, exactly: no |x|^2 + |y|^2 - 2 x.y, which cancels."""
-    x0, x1, x2 = x[i, 0], x[i, 1], x[i, 2]
-    for j in range(len(y)):
-        a = x0 - y[j, 0]
-        b = x1 - y[j, 1]
-        c = x2 - y[j, 2]
+def _squared_distances(x0, x1, x2, y0, y1, y2, row):
+    """One row of D, exactly: no |x|^2 + |y|^2 - 2 x.y, which cancels."""
+    for j in range(len(row)):
+        a = x0 - y0[j]
+        b = x1 - y1[j]
+        c = x2 - y2[j]
         row[j] = a * a + b * b + c * c
 
 
@@ -225,10 +224,10 @@ def _start_potentials(x, y, f, g, row):
 
     Returns the largest cost.
     """
-    n, m = len(x), len(y)
+    n, m = len(x), len(row)
     largest = np.float32(0)
     for i in range(n):
-        _squared_distances(x, y, i, row)
+        _squared_distances(x[i, 0], x[i, 1], x[i, 2], y[0], y[1], y[2], row)
         low = row[0]
         for j in range(m):
             low = min(low, row[j])
@@ -242,18 +241,24 @@ def _start_potentials(x, y, f, g, row):
 
 @nb.njit(nogil=True, fastmath=FAST, error_model="numpy", cache=True)
 def _gibbs(x, y, f, g, inv_eps, kernel):
-    n, m = kernel.shape
-    for i in range(n):
+    for i in range(len(x)):
         row = kernel[i]
-        _squared_distances(x, y, i, row)
-        fi = f[i]
-        for j in range(m):
-            row[j] = exp32((fi + g[j] - row[j]) * inv_eps)
+        _squared_distances(x[i, 0], x[i, 1], x[i, 2], y[0], y[1], y[2], row)
+        _exp_row(row, f[i], g, inv_eps)
+
+
+@nb.njit(nogil=True, fastmath=FAST, error_model="numpy", cache=True)
+def _exp_row(row, f, g, inv_eps):
+    for j in range(len(row)):
+        row[j] = exp32((f + g[j] - row[j]) * inv_eps)
 
 
 @nb.njit(nogil=True, fastmath=FAST, error_model="numpy", cache=True)
 def _iterate(kernel, u, v, t, omega):
-    """One relaxed scaling iteration in one pass over K; returns the L1 marginal errors before it and the largest scaling."""
+    """One relaxed scaling iteration in one pass over K; returns the L1 marginal errors before it and the largest scaling.
+
+    Four rows at a time, so that v and t are read and written once for four of them.
+    """
     n, m = kernel.shape
     a = np.float32(1.0) / np.float32(n)
     b = np.float32(1.0) / np.float32(m)
@@ -263,17 +268,29 @@ def _iterate(kernel, u, v, t, omega):
     extreme = np.float32(1)
     for j in range(m):
         t[j] = np.float32(0)
-    for i in range(n):
-        s = np.float32(0)
-        for j in range(m):
-            s += kernel[i, j] * v[j]
-        s *= b
-        error += abs(u[i] * s - np.float32(1)) * a
-        ui = np.float32(1) / s if plain else np.exp(-omega * np.log(s) + keep * np.log(u[i]))
-        u[i] = ui
-        extreme = max(extreme, max(ui, np.float32(1) / ui))
-        for j in range(m):
-            t[j] += kernel[i, j] * ui
+    sums = np.empty(4, np.float32)
+    for first in range(0, n, 4):
+        rows = min(4, n - first)
+        if rows == 4:
+            _dot_four(kernel[first], kernel[first + 1], kernel[first + 2], kernel[first + 3], v, sums)
+        else:
+            for r in range(rows):
+                sums[r] = _dot(kernel[first + r], v)
+        for r in range(rows):
+            i = first + r
+            s = sums[r] * b
+            error += abs(u[i] * s - np.float32(1)) * a
+            ui = np.float32(1) / s if plain else np.exp(-omega * np.log(s) + keep * np.log(u[i]))
+            u[i] = ui
+            extreme = max(extreme, max(ui, np.float32(1) / ui))
+        if rows == 4:
+            _add_four(
+                kernel[first], kernel[first + 1], kernel[first + 2], kernel[first + 3],
+                u[first], u[first + 1], u[first + 2], u[first + 3], t,
+            )  # fmt: skip
+        else:
+            for r in range(rows):
+                _add(kernel[first + r], u[first + r], t)
     for j in range(m):
         tj = t[j] * a
         error += abs(v[j] * tj - np.float32(1)) * b
@@ -281,6 +298,40 @@ def _iterate(kernel, u, v, t, omega):
         v[j] = vj
         extreme = max(extreme, max(vj, np.float32(1) / vj))
     return error, extreme
+
+
+@nb.njit(nogil=True, fastmath=FAST, error_model="numpy", cache=True)
+def _dot(row, v):
+    s = np.float32(0)
+    for j in range(len(v)):
+        s += row[j] * v[j]
+    return s
+
+
+@nb.njit(nogil=True, fastmath=FAST, error_model="numpy", cache=True)
+def _dot_four(row0, row1, row2, row3, v, sums):
+    s0 = np.float32(0)
+    s1 = np.float32(0)
+    s2 = np.float32(0)
+    s3 = np.float32(0)
+    for j in range(len(v)):
+        s0 += row0[j] * v[j]
+        s1 += row1[j] * v[j]
+        s2 += row2[j] * v[j]
+        s3 += row3[j] * v[j]
+    sums[0], sums[1], sums[2], sums[3] = s0, s1, s2, s3
+
+
+@nb.njit(nogil=True, fastmath=FAST, error_model="numpy", cache=True)
+def _add(row, u, t):
+    for j in range(len(t)):
+        t[j] += row[j] * u
+
+
+@nb.njit(nogil=True, fastmath=FAST, error_model="numpy", cache=True)
+def _add_four(row0, row1, row2, row3, u0, u1, u2, u3, t):
+    for j in range(len(t)):
+        t[j] += row0[j] * u0 + row1[j] * u1 + row2[j] * u2 + row3[j] * u3
 
 
 @nb.njit(nogil=True, error_model="numpy", cache=True)
@@ -297,7 +348,8 @@ def _absorb(u, v, f, g, eps):
 def _sinkhorn(x, y, reg, relative, tol, max_iter, kernel, f, g, u, v, t):
     """Solve one problem in the given workspace; on return P_ij = K_ij u_i v_j / (n m)."""
     n, m = len(x), len(y)
-    largest = _start_potentials(x, y, f, g, t)
+    columns = np.ascontiguousarray(y.T)  # (3, m): the inner loops run over targets
+    largest = _start_potentials(x, columns, f, g, t)
     eps = reg * largest if relative else reg
     if eps <= np.float32(0):  # one point, or all on one spot: every plan costs the same
         eps = np.float32(1)
@@ -310,7 +362,7 @@ def _sinkhorn(x, y, reg, relative, tol, max_iter, kernel, f, g, u, v, t):
     best = np.float32(np.inf)
     while True:
         final = level <= eps * np.float32(1.001)
-        _gibbs(x, y, f, g, np.float32(1) / level, kernel)
+        _gibbs(x, columns, f, g, np.float32(1) / level, kernel)
         if not final:
             for _ in range(min(_SWEEPS_PER_LEVEL, max_iter - its)):
                 _, extreme = _iterate(kernel, u, v, t, np.float32(1))
@@ -333,7 +385,7 @@ def _sinkhorn(x, y, reg, relative, tol, max_iter, kernel, f, g, u, v, t):
                 break
             if extreme > _ABSORB_ABOVE:
                 _absorb(u, v, f, g, eps)
-                _gibbs(x, y, f, g, np.float32(1) / eps, kernel)
+                _gibbs(x, columns, f, g, np.float32(1) / eps, kernel)
             if count % _CHECK_EVERY == 0:
                 if error <= np.float32(0.7) * tol:
                     break

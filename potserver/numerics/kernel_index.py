@@ -4,10 +4,10 @@
     phi_m(x) = exp(-gamma_m |x - h_m|^2)                                                        (paper eq. 1)
 
 A kernel's reach is where what it adds falls below a cut tau, which depends on its gamma, weight *and* variance. tau is
-chosen by measuring: at sample points, the absolute sum of everything cut must change the probability by less than a budget. Kernels are
-sorted into levels by reach (a factor of two each), every level into its own grid of cells, so wide and narrow ones cost alike.
-Queries are sorted into cubes; the kernels that reach a cube are gathered once, relative to its centre (so large coordinates
-lose nothing in float32), and a dense SIMD loop runs over queries times gathered kernels.
+chosen by measuring: at sample points, the absolute sum of everything cut must change the probability by less than a budget.
+Kernels are sorted into levels by reach (a factor of two each), every level into its own grid of cells, so wide and narrow
+ones cost alike. Queries are sorted into cubes; the kernels that reach a cube are gathered once, relative to its centre (so
+large coordinates lose nothing in float32), and a dense SIMD loop runs over queries times gathered kernels.
 """
 
 from __future__ import annotations

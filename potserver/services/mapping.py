@@ -92,7 +92,7 @@ class MappingService:
                 prior = carried.replace(
                     weight_var=carried.weight_var + np.float32(self.settings.borrowed_var)
                 )
-                instantaneous, _ = refine(prior, in_map, self.settings, threads=self._threads)
+                instantaneous = self._refine(prior, in_map, self.settings.instant_tolerance)
             with clock("fuse"):
                 kernels, added = self._fuse(prior, in_map)
         else:
@@ -212,8 +212,12 @@ class MappingService:
             carried = carried.take(present_activation < s.explained_activation)
         filled = fill_kernels(labelled, KernelSet.concatenate([local, carried]), s, threads=self._threads)
         new = KernelSet.concatenate([carried, filled])
-        refined, _ = refine(KernelSet.concatenate([local, new]), labelled, s, threads=self._threads)
+        refined = self._refine(KernelSet.concatenate([local, new]), labelled, s.refine_tolerance)
         return KernelSet.concatenate([present.take(~near), refined]), len(new)
+
+    def _refine(self, kernels: KernelSet, labelled: LabelledPoints, tolerance: float) -> KernelSet:
+        cut = self.settings.feature_cut
+        return refine(kernels, labelled, feature_cut=cut, tolerance=tolerance, threads=self._threads)
 
     def _support(self, kernels: KernelSet, labelled: LabelledPoints) -> np.ndarray:
         """(K,) how many labelled points each kernel has, each counted by its activation."""

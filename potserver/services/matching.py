@@ -118,7 +118,7 @@ class Matcher:
         )  # fmt: skip
         return solved.cost.astype(np.float64), solved.converged
 
-    def _best(self, sector: Sector, rows_hits, rows_free, hits, free) -> Match | None:  # type: ignore[no-untyped-def]
+    def _best(self, sector: Sector, rows_hits, rows_free, hits, free) -> Match | None:
         score = np.zeros(len(self._candidates))
         w2 = np.zeros(len(self._candidates))
         converged = np.ones(len(self._candidates), bool)

@@ -11,7 +11,7 @@ from potserver.domain.types import Float64, KernelSet
 from potserver.numerics.beams import LabelledPoints
 from potserver.numerics.geometry import voxel_pick
 from potserver.numerics.kernel_index import build_index, latent_sums, sparse_features
-from potserver.numerics.logistic import WeightPosterior, fit_sparse
+from potserver.numerics.logistic import fit_sparse
 from potserver.services.settings import MappingSettings
 
 _GAMMA_SHAPE = 100.0  # a placed kernel's width is known to 10 %
@@ -90,18 +90,26 @@ def activation(kernels: KernelSet, points: Float64, *, threads: int) -> np.ndarr
 
 
 def refine(
-    kernels: KernelSet, labelled: LabelledPoints, settings: MappingSettings, *, threads: int
-) -> tuple[KernelSet, WeightPosterior]:
-    """Solve all weights of `kernels` jointly on labelled points; their present mean and variance are the prior."""
+    kernels: KernelSet, labelled: LabelledPoints, *, feature_cut: float, tolerance: float, threads: int
+) -> KernelSet:
+    """Solve all weights of `kernels` jointly on labelled points; their present mean and variance are the prior.
+
+    Args:
+        kernels: In the frame of the points.
+        labelled: What a scan says.
+        feature_cut: Activations below this are left out of the solve.
+        tolerance: Of the gradient, relative to its start.
+        threads: Threads of the solve.
+    """
     features = sparse_features(
         labelled.points,
         kernels.hinge_mean,
         kernels.gamma.astype(np.float64),
-        cut=settings.feature_cut,
+        cut=feature_cut,
         threads=threads,
     )
     posterior = fit_sparse(
         features, labelled.occupied, kernels.weight_mean, kernels.weight_var,
-        tolerance=settings.refine_tolerance, threads=threads,
+        tolerance=tolerance, threads=threads,
     )  # fmt: skip
-    return kernels.replace(weight_mean=posterior.mean, weight_var=posterior.var), posterior
+    return kernels.replace(weight_mean=posterior.mean, weight_var=posterior.var)

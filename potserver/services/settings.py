@@ -42,17 +42,17 @@ class MappingSettings:
     )
 
     # ranking (eq. 6-7)
-    rank_hits: int = 100
-    rank_free: int = 60
+    rank_hits: int = 96
+    rank_free: int = 64
     rank_reg_m2: float = 2.0
-    rank_tolerance: float = 1e-3
+    rank_tolerance: float = 1e-2
     rank_iterations: int = 1000
     rank_score: RankScore = RankScore.W2
     rotations_deg: tuple[float, ...] = (-30.0, -15.0, 0.0, 15.0, 30.0)
 
     # final coupling (eq. 3-4)
-    couple_points: int = 400
-    couple_reg: float = 0.0005  # of the largest cost
+    couple_points: int = 300
+    couple_reg: float = 0.001  # of the largest cost
     couple_tolerance: float = 1e-3
     couple_iterations: int = 2000
     label_aware: bool = (
@@ -68,8 +68,9 @@ class MappingSettings:
     )
     fill_coarse_m: float = 1.0  # spacing of kernels added where nothing explains a point; 0 adds none
     fill_fine_m: float = 0.3  # the same near hits
-    feature_cut: float = 0.01  # activations below this are left out of the solve
-    refine_tolerance: float = 0.03  # of the gradient, at which the solve stops
+    feature_cut: float = 0.02  # activations below this are left out of the solve
+    refine_tolerance: float = 0.03  # of the gradient, at which the overall map's solve stops
+    instant_tolerance: float = 0.1  # the same for the instantaneous map
     explained_activation: float = 1.0  # a point with less from kernels of the right scale gets one of its own
 
     # answers
@@ -83,7 +84,7 @@ class MappingSettings:
         for name in (
             "max_range_m", "free_per_beam", "beams_per_scan", "n_sectors", "rank_hits", "rank_free", "rank_reg_m2",
             "rank_tolerance", "rank_iterations", "couple_points", "couple_reg", "couple_tolerance", "couple_iterations",
-            "prior_var", "feature_cut", "refine_tolerance", "explained_activation", "observed_activation", "tile_size_m",
+            "prior_var", "feature_cut", "refine_tolerance", "instant_tolerance", "explained_activation", "observed_activation", "tile_size_m",
         ):  # fmt: skip
             self._need(name, getattr(self, name) > 0, "positive")
         self._need("rotations_deg", len(self.rotations_deg) > 0, "at least one angle")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 
 import numpy as np
@@ -31,6 +32,7 @@ def _source(seed: int, dims: int) -> np.ndarray:
     return points[np.abs(np.arctan2(points[:, 1], points[:, 0])) < math.radians(30)][:N_HITS]
 
 
+@functools.cache
 def _atom(number: int, dims: int):
     hits = _source(number, dims)
     rng = np.random.default_rng(50 + number)

@@ -45,36 +45,22 @@ def test_eq4_at_the_ranking_settings(n: int, m: int, dims: int, method: str) -> 
 
 @pytest.mark.parametrize("dims", [2, 3])
 def test_eq4_at_the_final_settings(dims: int) -> None:
-    """500 points, reg 0.0005 of the largest cost; eq. 3 by POT on the cost divided by its maximum."""
+    """500 points, reg 0.0005 of the largest cost, which is the authors' 0.0005 on the cost divided by its maximum."""
     rng = np.random.default_rng(dims)
     x, y = _walls(rng, 500, dims), (reference.rotated(_walls(rng, 450, dims), 0.2) * 1.1).astype(np.float32)
-    cost = reference.squared_distances(x, y)
-    # from the coarser problem's potentials, or POT alone takes minutes
-    scaled = cost / cost.max()
-    warm = None
-    for reg in (0.01, 0.002, FINAL_REG):
-        if warm is not None:
-            warm = (warm[0] * before / reg, warm[1] * before / reg)
-        plan, log = ot.sinkhorn(
-            [],
-            [],
-            scaled,
-            reg,
-            method="sinkhorn_log",
-            stopThr=1e-7,
-            numItermax=6_000,
-            log=True,
-            warn=False,
-            warmstart=warm,
-        )
-        warm, before = (log["log_u"] - np.log(1 / 500), log["log_v"] - np.log(1 / 450)), reg
-        warm = (log["log_u"], log["log_v"])
-    assert np.abs(plan.sum(axis=0) - 1 / 450).sum() < 1e-5
-    ours = couple(x, y, reg=FINAL_REG, tolerance=2e-5, max_iterations=20_000)
+    ours = couple(x, y, reg=FINAL_REG, max_iterations=20_000)
     assert ours.converged
+    cost = reference.squared_distances(x, y)
+    assert ours.reg == pytest.approx(FINAL_REG * cost.max(), rel=1e-5)
+    # eq. 4 has one solution, wherever a solver starts; from nowhere, POT would need minutes to get there
+    start = (ours.source_potential.astype(np.float64), ours.target_potential.astype(np.float64))
+    plan = ot.bregman.sinkhorn_stabilized(
+        np.full(500, 1 / 500), np.full(450, 1 / 450), cost, FINAL_REG * cost.max(), stopThr=1e-8, numItermax=20_000,
+        warmstart=start,
+    )  # fmt: skip
+    assert np.abs(plan.sum(axis=0) - 1 / 450).sum() + np.abs(plan.sum(axis=1) - 1 / 500).sum() < 1e-6
     assert ours.cost == pytest.approx(float((plan * cost).sum()), rel=1e-4)
     assert np.abs(ours.plan - plan).sum() < 1e-3
-    assert ours.reg == pytest.approx(FINAL_REG * cost.max(), rel=1e-5)
 
 
 @pytest.mark.parametrize("reg", [1e-3, 1e-2, 0.1])
@@ -104,10 +90,10 @@ def test_eq4_with_growing_lambda_tends_to_the_linear_program() -> None:
     x, y = _walls(rng, 50, 3), (_walls(rng, 50, 3) + np.float32(1.0)).astype(np.float32)
     exact = float(ot.emd2([], [], reference.squared_distances(x, y)))
     gaps = []
-    for reg in (3e-2, 1e-2, 3e-3, 1e-3):
+    for reg in (3e-2, 1e-2, 3e-3, 1e-3, 3e-4):
         ours = couple(x, y, reg=reg, tolerance=1e-4, max_iterations=50_000)
         assert ours.converged, reg
         gaps.append(ours.cost - exact)
     assert all(earlier > later for earlier, later in zip(gaps, gaps[1:], strict=False)), gaps
-    assert -1e-3 * exact < gaps[-1] < 0.02 * exact, (gaps, exact)
+    assert -1e-3 * exact < gaps[-1] < 0.005 * exact, (gaps, exact)
     assert gaps[0] > 0.05 * exact, "the largest reg must be visibly blurred, or the limit shows nothing"

@@ -64,13 +64,12 @@ def test_eq6_eq7_choice_equals_brute_force(score: RankScore, seed: int) -> None:
     atoms = _atoms(seed)
     rng = np.random.default_rng(100 + seed)
     sectors = []
-    for i in range(3):
+    for _ in range(3):
         source = atoms[int(rng.integers(len(atoms)))]
         angle, offset = rng.uniform(-math.pi, math.pi), rng.normal(0.0, 5.0, 3)
         hits = reference.rotated(source.hit_points, angle) * rng.uniform(0.8, 1.2, 3) + offset
         free = reference.rotated(source.free_points, angle) + rng.normal(0.0, 0.5, 3) + offset
         sectors.append(reference.sector(_apart(hits), _apart(free)))
-        assert i < 3
     found = Matcher(AtomDictionary(tuple(atoms)), _settings(score), threads=2, seed=0).match(sectors)
     for sector, match in zip(sectors, found, strict=True):
         truth = reference.rank(atoms, ROTATIONS, sector, REG)
@@ -89,10 +88,10 @@ def test_the_two_scores_are_not_the_same_rule() -> None:
     """Row A7: far free points dominate eq. 7, and count as much as hits in the authors' score."""
     rng = np.random.default_rng(4)
     hits, free = reference.spaced(rng, 30, *BOX, 0.8), reference.spaced(rng, 25, *BOX, 0.8)
-    wide = np.array([3.0, 3.0, 1.0])
+    wide = np.array([1.8, 1.8, 1.0])
     like_hits = reference.atom("hits", hits, _apart(free * wide * 1.15))
     like_free = reference.atom("free", _apart(hits * [1.0, 1.6, 1.0]), _apart(free * wide))
-    poor = reference.atom("poor", _apart(hits * [0.2, 2.9, 1.0]), _apart(free * 5.5))
+    poor = reference.atom("poor", _apart(hits * [0.4, 2.0, 1.0]), _apart(free * 2.6))
     target = reference.sector(hits, _apart(free * wide))
     atoms = [like_hits, like_free, poor]
     for score in RankScore:
