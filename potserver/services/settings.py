@@ -84,7 +84,8 @@ class MappingSettings:
         for name in (
             "max_range_m", "free_per_beam", "beams_per_scan", "n_sectors", "rank_hits", "rank_free", "rank_reg_m2",
             "rank_tolerance", "rank_iterations", "couple_points", "couple_reg", "couple_tolerance", "couple_iterations",
-            "prior_var", "feature_cut", "refine_tolerance", "instant_tolerance", "explained_activation", "observed_activation", "tile_size_m",
+            "prior_var", "feature_cut", "refine_tolerance", "instant_tolerance", "explained_activation",
+            "observed_activation", "tile_size_m",
         ):  # fmt: skip
             self._need(name, getattr(self, name) > 0, "positive")
         self._need("rotations_deg", len(self.rotations_deg) > 0, "at least one angle")
