@@ -6,6 +6,7 @@ import dataclasses
 import io
 import json
 import zipfile
+import zlib
 from collections.abc import Iterator
 from importlib import resources
 from pathlib import Path
@@ -13,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from potserver.domain.types import Atom, KernelSet
-from potserver.errors import DictionaryError, UnknownAtomError
+from potserver.errors import DictionaryError, ShapeError, UnknownAtomError
 
 FORMAT = "potserver-atoms"
 FORMAT_VERSION = 1
@@ -98,13 +99,26 @@ class AtomDictionary:
             DictionaryError: missing, damaged (every member has a checksum), or of another format or version.
         """
         try:
-            with np.load(path, allow_pickle=False) as file:
+            # opened here, because numpy leaves the file of a damaged archive open
+            with Path(path).open("rb") as stream, np.load(stream, allow_pickle=False) as file:
                 arrays = {name: file[name] for name in file.files}
             header = json.loads(arrays["header"].tobytes())
         except FileNotFoundError:
             raise DictionaryError(f"no atom dictionary at {path}") from None
-        except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
+        except (
+            OSError,
+            EOFError,
+            ValueError,
+            KeyError,
+            RuntimeError,
+            zipfile.BadZipFile,
+            zlib.error,
+        ) as error:
             raise DictionaryError(f"{path} is not an atom dictionary, or is damaged: {error}") from error
+        if not isinstance(header, dict):
+            raise DictionaryError(
+                f"{path} is not an atom dictionary: its header is a {type(header).__name__}"
+            )
         if header.get("format") != FORMAT or header.get("version") != FORMAT_VERSION:
             raise DictionaryError(
                 f"{path}: format {header.get('format')!r} version {header.get('version')!r},"
@@ -121,5 +135,5 @@ class AtomDictionary:
                     for i, entry in enumerate(header["atoms"])
                 )
             )
-        except (KeyError, TypeError) as error:
+        except (KeyError, TypeError, ShapeError) as error:
             raise DictionaryError(f"{path}: an atom is incomplete: {error}") from error

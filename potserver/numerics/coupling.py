@@ -27,6 +27,7 @@ Int64 = NDArray[np.int64]
 _CHECK_EVERY = 5
 _PLAIN_ITERATIONS = 15  # at the final level, before the contraction is measured
 _SWEEPS_PER_LEVEL = 4
+_FIRST_LEVEL = np.float32(0.02)  # of the largest cost: where the regularisation starts
 _ABSORB_ABOVE = np.float32(1e12)
 
 
@@ -354,7 +355,7 @@ def _sinkhorn(x, y, reg, relative, tol, max_iter, kernel, f, g, u, v, t):
     if eps <= np.float32(0):  # one point, or all on one spot: every plan costs the same
         eps = np.float32(1)
     level = eps
-    while level < np.float32(0.02) * largest < np.float32(np.inf):
+    while level < _FIRST_LEVEL * largest < np.float32(np.inf):
         level *= np.float32(2)
     u[:] = np.float32(1)
     v[:] = np.float32(1)

@@ -44,7 +44,7 @@ class MappingSettings:
     # ranking (eq. 6-7)
     rank_hits: int = 96
     rank_free: int = 64
-    rank_reg_m2: float = 2.0
+    rank_reg_m2: float = 5.0
     rank_tolerance: float = 1e-2
     rank_iterations: int = 1000
     rank_score: RankScore = RankScore.W2

@@ -44,7 +44,8 @@ def transport(match: Match, sector: Sector, settings: MappingSettings, seed: int
         y = (_subsample(target, settings, rng) - target_centre).astype(np.float32)
         coupling = _couple(x, y, settings)
         solved.append(coupling)
-        hinge[members] = carry(hinge[members], x, y, coupling, settings.out_of_sample)
+        if coupling.converged:
+            hinge[members] = carry(hinge[members], x, y, coupling, settings.out_of_sample)
 
     hits = bool(len(atom.hit_points) and len(sector.hit_points))
     free = bool(len(atom.free_points) and len(sector.free_points))
