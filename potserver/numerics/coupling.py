@@ -29,6 +29,7 @@ _PLAIN_ITERATIONS = 15  # at the final level, before the contraction is measured
 _SWEEPS_PER_LEVEL = 4
 _FIRST_LEVEL = np.float32(0.02)  # of the largest cost: where the regularisation starts
 _ABSORB_ABOVE = np.float32(1e12)
+_MOST_LEVELS = 60  # halvings of reg on the way to its value
 
 
 class Ragged(NamedTuple):
@@ -354,15 +355,18 @@ def _sinkhorn(x, y, reg, relative, tol, max_iter, kernel, f, g, u, v, t):
     eps = reg * largest if relative else reg
     if eps <= np.float32(0):  # one point, or all on one spot: every plan costs the same
         eps = np.float32(1)
+    # levels are counted: with costs that overflow, a comparison of floats under fast-math might never end the loop
     level = eps
-    while level < _FIRST_LEVEL * largest < np.float32(np.inf):
+    levels = 0
+    while levels < _MOST_LEVELS and level < _FIRST_LEVEL * largest:
         level *= np.float32(2)
+        levels += 1
     u[:] = np.float32(1)
     v[:] = np.float32(1)
     its = 0
     best = np.float32(np.inf)
     while True:
-        final = level <= eps * np.float32(1.001)
+        final = levels == 0
         _gibbs(x, columns, f, g, np.float32(1) / level, kernel)
         if not final:
             for _ in range(min(_SWEEPS_PER_LEVEL, max_iter - its)):
@@ -371,7 +375,8 @@ def _sinkhorn(x, y, reg, relative, tol, max_iter, kernel, f, g, u, v, t):
                 if extreme > _ABSORB_ABOVE:
                     break
             _absorb(u, v, f, g, level)
-            level = max(level * np.float32(0.5), eps)
+            levels -= 1
+            level = eps if levels == 0 else level * np.float32(0.5)
             continue
         omega = np.float32(1)
         error = np.float32(np.inf)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
+import numba as nb
 import numpy as np
 import ot
 from numpy.typing import ArrayLike, NDArray
@@ -26,12 +27,23 @@ def latent(
     points: ArrayLike, hinge: ArrayLike, gamma: ArrayLike, weight: ArrayLike, variance: ArrayLike
 ) -> Latent:
     """Eq. 1 in float64: every kernel at every point."""
-    h, g, w, v = (np.asarray(a, np.float64) for a in (hinge, gamma, weight, variance))
-    rows = []
-    for point in np.asarray(points, np.float64):
-        phi = np.exp(-g * np.square(h - point).sum(axis=1))
-        rows.append((phi @ w, np.square(phi) @ v, phi.sum()))
-    return Latent(*np.asarray(rows, np.float64).reshape(-1, 3).T)
+    arrays = (np.ascontiguousarray(a, np.float64) for a in (points, hinge, gamma, weight, variance))
+    return Latent(*_latent(*arrays))
+
+
+@nb.njit(cache=True)
+def _latent(points, hinge, gamma, weight, variance):
+    sums = np.zeros((3, len(points)))
+    for i in range(len(points)):
+        for m in range(len(hinge)):
+            d2 = 0.0
+            for c in range(points.shape[1]):
+                d2 += (points[i, c] - hinge[m, c]) ** 2
+            phi = np.exp(-gamma[m] * d2)
+            sums[0, i] += weight[m] * phi
+            sums[1, i] += variance[m] * phi * phi
+            sums[2, i] += phi
+    return sums
 
 
 def moderated(mean: ArrayLike, var: ArrayLike) -> Float64:

@@ -10,7 +10,7 @@ from potserver.numerics.occupancy import predict_occupancy
 from tests.conformance import reference
 
 K = 100_000
-N = 60
+N = 100
 WITHIN = 1e-4  # of a probability
 
 

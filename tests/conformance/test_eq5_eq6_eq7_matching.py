@@ -85,22 +85,25 @@ def test_eq6_eq7_choice_equals_brute_force(score: RankScore, seed: int) -> None:
 
 
 def test_the_two_scores_are_not_the_same_rule() -> None:
-    """Row A7: far free points dominate eq. 7, and count as much as hits in the authors' score."""
+    """Row A7: wide free space outweighs the hits in eq. 7, and counts as much as they do in the authors' score."""
     rng = np.random.default_rng(4)
-    hits, free = reference.spaced(rng, 30, *BOX, 0.8), reference.spaced(rng, 25, *BOX, 0.8)
-    wide = np.array([1.8, 1.8, 1.0])
-    like_hits = reference.atom("hits", hits, _apart(free * wide * 1.15))
-    like_free = reference.atom("free", _apart(hits * [1.0, 1.6, 1.0]), _apart(free * wide))
-    poor = reference.atom("poor", _apart(hits * [0.4, 2.0, 1.0]), _apart(free * 2.6))
-    target = reference.sector(hits, _apart(free * wide))
-    atoms = [like_hits, like_free, poor]
+    hits = _apart(reference.spaced(rng, 30, *BOX, 1.6) * 0.5)
+    free = _apart(reference.spaced(rng, 25, *BOX, 0.8) * 1.2)
+    atoms = [
+        reference.atom("right-hits", hits, _apart(free * 1.45)),
+        reference.atom("right-free", _apart(hits * 1.5), free),
+        reference.atom("poor", _apart(hits * 1.575), _apart(free * 2.2)),
+    ]
+    target = reference.sector(hits, free)
+    truth = reference.rank(atoms, ROTATIONS, target, REG)
+    chosen = {}
     for score in RankScore:
-        truth = reference.rank(atoms, ROTATIONS, target, REG)
-        wanted = truth.w2 if score is RankScore.W2 else truth.normalised
-        a = int(np.unravel_index(int(wanted.argmin()), wanted.shape)[0])
         match = Matcher(AtomDictionary(tuple(atoms)), _settings(score), threads=1, seed=0).match([target])[0]
         assert match is not None
-        assert match.atom.atom_id == atoms[a].atom_id
+        wanted = truth.w2 if score is RankScore.W2 else truth.normalised
+        assert match.atom is atoms[int(wanted.min(axis=1).argmin())]
+        chosen[score] = match.atom.atom_id
+    assert chosen == {RankScore.W2: "right-free", RankScore.NORMALISED: "right-hits"}
 
 
 @pytest.mark.parametrize("score", list(RankScore))

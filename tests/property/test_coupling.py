@@ -18,7 +18,9 @@ TOLERANCE = 1e-5
 def _pair(seed: int, n: int, m: int) -> tuple[np.ndarray, np.ndarray]:
     rng = np.random.default_rng(seed)
     scale = rng.uniform(0.1, 10.0, 3)
-    return (rng.normal(size=(n, 3)) * scale).astype(np.float32), (rng.normal(size=(m, 3)) * scale[::-1]).astype(np.float32)
+    return (rng.normal(size=(n, 3)) * scale).astype(np.float32), (
+        rng.normal(size=(m, 3)) * scale[::-1]
+    ).astype(np.float32)
 
 
 def _solve(x: np.ndarray, y: np.ndarray):
@@ -82,12 +84,15 @@ def test_a_ragged_batch_is_its_problems_one_by_one_on_any_number_of_threads(
     targets = [_pair(seed - i, 1, n)[1] for i, n in enumerate(reversed(sizes))]
     pairs = np.stack(np.meshgrid(np.arange(len(sizes)), np.arange(len(sizes))), axis=-1).reshape(-1, 2)
     batch, threaded = (
-        coupling_costs(Ragged.of(sources), Ragged.of(targets), pairs, reg=reg, threads=threads) for threads in (1, 3)
+        coupling_costs(Ragged.of(sources), Ragged.of(targets), pairs, reg=reg, threads=threads)
+        for threads in (1, 3)
     )
     for one, other in zip(batch, threaded, strict=True):
         np.testing.assert_array_equal(one, other)
     for p, (s, t) in enumerate(pairs):
-        alone = coupling_costs(Ragged.of([sources[s]]), Ragged.of([targets[t]]), np.zeros((1, 2), np.int64), reg=reg)
+        alone = coupling_costs(
+            Ragged.of([sources[s]]), Ragged.of([targets[t]]), np.zeros((1, 2), np.int64), reg=reg
+        )
         assert alone.cost[0] == batch.cost[p]
         assert alone.n_iterations[0] == batch.n_iterations[p]
         assert alone.converged[0] == batch.converged[p]
@@ -113,6 +118,11 @@ def test_no_solve_claims_success_with_numbers_that_are_not_finite(
         assert np.isfinite(solved.plan).all()
         assert abs(float(solved.plan.sum(dtype=np.float64)) - 1.0) < 1e-3
     batch = coupling_costs(
-        Ragged.of([x]), Ragged.of([y]), np.zeros((1, 2), np.int64), reg=reg, relative=relative, max_iterations=60
+        Ragged.of([x]),
+        Ragged.of([y]),
+        np.zeros((1, 2), np.int64),
+        reg=reg,
+        relative=relative,
+        max_iterations=60,
     )
     assert np.isfinite(batch.cost[batch.converged]).all()

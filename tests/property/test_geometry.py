@@ -2,13 +2,21 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from potserver.numerics.geometry import in_sector, rotated_diagonal, rotation_z, sector_edges, thin, voxel_pick
+from potserver.numerics.geometry import (
+    in_sector,
+    rotated_diagonal,
+    rotation_z,
+    sector_edges,
+    thin,
+    voxel_pick,
+)
 
 ANGLES = st.floats(-10.0, 10.0)
 SEEDS = st.integers(0, 2**31)
@@ -21,7 +29,7 @@ def test_every_point_is_in_exactly_one_sector(n: int, heading: float, angles: li
     points = np.stack([np.cos(bearing), np.sin(bearing), np.zeros(len(bearing))], axis=1)
     count = sum(
         in_sector(points, heading + low, heading + high, 2.0).astype(int)
-        for low, high in zip(edges[:-1], edges[1:], strict=True)
+        for low, high in itertools.pairwise(edges)
     )
     np.testing.assert_array_equal(count, 1)
 
@@ -38,7 +46,9 @@ def test_turning_points_and_sector_together_changes_no_membership(
     points = np.stack([5 * np.cos(angle), 5 * np.sin(angle), 0 * angle], axis=1)
     before = in_sector(points, low, low + width, 6.0)
     np.testing.assert_array_equal(before, ((angle - low) % (2 * np.pi)) < width)
-    np.testing.assert_array_equal(before, in_sector(points @ rotation_z(turn).T, low + turn, low + width + turn, 6.0))
+    np.testing.assert_array_equal(
+        before, in_sector(points @ rotation_z(turn).T, low + turn, low + width + turn, 6.0)
+    )
 
 
 @given(seed=SEEDS, n=st.integers(0, 300), n_max=st.integers(1, 100), voxel=st.floats(0.05, 5.0))

@@ -27,7 +27,12 @@ class Case:
         self.points = points[np.abs(activation - OBSERVED_ACTIVATION) > 0.3 * OBSERVED_ACTIVATION]
 
     def map(self, **changes) -> KernelMap:
-        arrays = {"hinge_points": self.hinge, "gamma": self.gamma, "weight_mean": self.weight, "weight_var": self.var}
+        arrays = {
+            "hinge_points": self.hinge,
+            "gamma": self.gamma,
+            "weight_mean": self.weight,
+            "weight_var": self.var,
+        }
         return KernelMap.from_arrays(**(arrays | changes), threads=2)
 
 
@@ -43,7 +48,9 @@ def test_the_order_of_the_kernels_does_not_matter(seed: int, k: int) -> None:
 
 
 @given(seed=SEEDS, k=st.integers(1, 200), shift=st.tuples(*[st.floats(-5e6, 5e6)] * 3))
-def test_moving_map_and_queries_together_changes_nothing(seed: int, k: int, shift: tuple[float, float, float]) -> None:
+def test_moving_map_and_queries_together_changes_nothing(
+    seed: int, k: int, shift: tuple[float, float, float]
+) -> None:
     case = Case(seed, k)
     one = case.map().occupancy(case.points)
     other = case.map(hinge_points=case.hinge + shift).occupancy(case.points + shift)

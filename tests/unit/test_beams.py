@@ -24,7 +24,9 @@ def test_free_points_are_stratified_and_keep_the_gap(free_per_beam: int, gap_m: 
     free = ~labelled.occupied
     along = np.linalg.norm(labelled.points[free], axis=1)
     beam = labelled.beam[free]
-    np.testing.assert_allclose(labelled.points[free], beams.ends[beam] / length[beam, None] * along[:, None], atol=1e-9)
+    np.testing.assert_allclose(
+        labelled.points[free], beams.ends[beam] / length[beam, None] * along[:, None], atol=1e-9
+    )
     usable = np.where(beams.is_return, length - gap_m, length)
     assert (along <= usable[beam] + 1e-9).all()
     for b in np.unique(beam):
@@ -56,21 +58,26 @@ def test_a_hit_nearer_than_the_gap_gives_no_free_point() -> None:
 
 
 def test_no_beams_no_points() -> None:
-    empty = label_beams(Beams(np.zeros((0, 3)), np.zeros(0, bool)), free_per_beam=2, gap_m=0.3, rng=np.random.default_rng(1))
+    empty = label_beams(
+        Beams(np.zeros((0, 3)), np.zeros(0, bool)), free_per_beam=2, gap_m=0.3, rng=np.random.default_rng(1)
+    )
     assert empty.points.shape == (0, 3)
     assert empty.beam.shape == empty.occupied.shape == (0,)
 
 
 def test_the_free_points_depend_on_the_seed_alone() -> None:
     first, again, other = (
-        label_beams(_beams(), free_per_beam=2, gap_m=0.3, rng=np.random.default_rng(s)).points for s in (1, 1, 2)
+        label_beams(_beams(), free_per_beam=2, gap_m=0.3, rng=np.random.default_rng(s)).points
+        for s in (1, 1, 2)
     )
     np.testing.assert_array_equal(first, again)
     assert not np.array_equal(first, other)
 
 
 def test_range_limits() -> None:
-    ends = np.array([[0.2, 0, 0], [0.3, 0, 0], [0, 5, 0], [0, 0, 25.0], [30.0, 40.0, 0], [0, 60.0, 0], [0.0, 0, 0]])
+    ends = np.array(
+        [[0.2, 0, 0], [0.3, 0, 0], [0, 5, 0], [0, 0, 25.0], [30.0, 40.0, 0], [0, 60.0, 0], [0.0, 0, 0]]
+    )
     returned = np.array([True, True, False, True, True, False, True])
     limited = limit_range(Beams(ends, returned), 0.3, 25.0)
     np.testing.assert_allclose(limited.ends, [[0.3, 0, 0], [0, 5, 0], [0, 0, 25], [15, 20, 0], [0, 25, 0]])

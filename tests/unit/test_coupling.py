@@ -75,7 +75,9 @@ def test_no_pairs_no_costs() -> None:
 def test_a_batch_solves_the_pairs_it_is_given_in_that_order() -> None:
     sources, targets = [_cloud(1, 20), _cloud(2, 30)], [_cloud(3, 25), _cloud(4, 10, 9.0)]
     pairs = np.array([[1, 1], [0, 0], [1, 0], [0, 1], [0, 0]])
-    batch = coupling_costs(Ragged.of(sources), Ragged.of(targets), pairs, reg=0.01, relative=True, tolerance=1e-4)
+    batch = coupling_costs(
+        Ragged.of(sources), Ragged.of(targets), pairs, reg=0.01, relative=True, tolerance=1e-4
+    )
     for p, (s, t) in enumerate(pairs):
         alone = couple(sources[s], targets[t], reg=0.01)
         assert float(batch.cost[p]) == pytest.approx(alone.cost, rel=1e-3)
@@ -147,7 +149,12 @@ def test_degenerate_sets_end_finite_or_say_that_they_failed(name: str, reg: floa
     for relative in (True, False):
         _honest(
             coupling_costs(
-                Ragged.of([x]), Ragged.of([y]), np.zeros((1, 2), np.int64), reg=reg, relative=relative, max_iterations=300
+                Ragged.of([x]),
+                Ragged.of([y]),
+                np.zeros((1, 2), np.int64),
+                reg=reg,
+                relative=relative,
+                max_iterations=300,
             )
         )
 
@@ -164,5 +171,7 @@ def test_trivial_sets_have_their_obvious_cost(name: str) -> None:
 def test_an_overflowing_solve_is_not_converged() -> None:
     x, y = DEGENERATE["squares overflow"]
     assert not couple(x, y, reg=0.01).converged
-    assert not coupling_costs(Ragged.of([x]), Ragged.of([y]), np.zeros((1, 2), np.int64), reg=2.0).converged.any()
+    assert not coupling_costs(
+        Ragged.of([x]), Ragged.of([y]), np.zeros((1, 2), np.int64), reg=2.0
+    ).converged.any()
     assert not couple(_cloud(1, 30), _cloud(2, 30), reg=1e-30).converged

@@ -58,7 +58,10 @@ def test_the_file_holds_everything(atoms: AtomDictionary, tmp_path: Path) -> Non
         for name in ("atom_id", "dims", "radius_m", "azimuth_width_rad", "provenance"):
             assert getattr(before, name) == getattr(after, name)
         arrays = [(before.hit_points, after.hit_points), (before.free_points, after.free_points)]
-        arrays += [(getattr(before.kernels, f.name), getattr(after.kernels, f.name)) for f in dataclasses.fields(KernelSet)]
+        arrays += [
+            (getattr(before.kernels, f.name), getattr(after.kernels, f.name))
+            for f in dataclasses.fields(KernelSet)
+        ]
         for one, other in arrays:
             np.testing.assert_array_equal(one, other)
             assert one.dtype == other.dtype

@@ -10,7 +10,9 @@ from potserver.numerics.displacement import OutOfSample, barycentric_images, car
 
 RNG = np.random.default_rng(0)
 # far apart, so that no entropy blurs one into the next
-SOURCE = np.stack(np.meshgrid([0.0, 4.0, 8.0], [0.0, 5.0], [0.0, 3.0]), axis=-1).reshape(-1, 3).astype(np.float32)
+SOURCE = (
+    np.stack(np.meshgrid([0.0, 4.0, 8.0], [0.0, 5.0], [0.0, 3.0]), axis=-1).reshape(-1, 3).astype(np.float32)
+)
 SHIFT = np.float32([0.5, -0.75, 0.25])
 KERNELS = RNG.uniform(-2, 10, (40, 3))
 

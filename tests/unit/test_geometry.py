@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import numpy as np
@@ -25,12 +26,14 @@ def test_sectors_share_no_point_and_miss_none_even_on_their_edges(n: int) -> Non
     edges = sector_edges(n)
     for heading in np.linspace(-4.0, 4.0, 41):
         on = heading + edges
-        angle = np.concatenate([on, np.nextafter(on, 99), np.nextafter(on, -99), np.linspace(-np.pi, np.pi, 97)])
+        angle = np.concatenate(
+            [on, np.nextafter(on, 99), np.nextafter(on, -99), np.linspace(-np.pi, np.pi, 97)]
+        )
         angle = np.concatenate([angle, np.arctan2(np.sin(angle), np.cos(angle))])
         points = np.stack([3 * np.cos(angle), 3 * np.sin(angle), 0 * angle], axis=1)
         hits = sum(
             in_sector(points, heading + low, heading + high, 10.0).astype(int)
-            for low, high in zip(edges[:-1], edges[1:], strict=True)
+            for low, high in itertools.pairwise(edges)
         )
         np.testing.assert_array_equal(hits, 1)
 

@@ -2,10 +2,19 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 
-from potserver.numerics.kernel_index import build_index, group_points, latent_sums, reach, sparse_features, stack_sizes
+from potserver.numerics.kernel_index import (
+    build_index,
+    group_points,
+    latent_sums,
+    reach,
+    sparse_features,
+    stack_sizes,
+)
 
 
 def _case(k: int = 400, n: int = 150, seed: int = 0, size: float = 20.0):
@@ -23,7 +32,9 @@ def _phi(points, hinge, gamma):
 def test_sums_are_those_of_every_kernel(threads: int) -> None:
     points, hinge, gamma, w, v = _case()
     phi = _phi(points, hinge, gamma)
-    sums = latent_sums(build_index(hinge, gamma, w, v, activation_cut=1e-6, tau=1e-9), points, threads=threads)
+    sums = latent_sums(
+        build_index(hinge, gamma, w, v, activation_cut=1e-6, tau=1e-9), points, threads=threads
+    )
     np.testing.assert_allclose(sums.mean, phi @ w, atol=2e-5)
     np.testing.assert_allclose(sums.var, np.square(phi) @ v, rtol=2e-5, atol=2e-5)
     np.testing.assert_allclose(sums.activation, phi.sum(axis=1), rtol=2e-5, atol=2e-5)
@@ -77,7 +88,9 @@ def test_no_kernels_and_no_points() -> None:
     points, hinge, gamma, w, v = _case()
     none = build_index(np.zeros((0, 3)), np.zeros(0), np.zeros(0), np.zeros(0), activation_cut=0.01)
     assert not any(np.any(s) for s in latent_sums(none, points))
-    assert all(len(s) == 0 for s in latent_sums(build_index(hinge, gamma, w, v, activation_cut=0.01), points[:0]))
+    assert all(
+        len(s) == 0 for s in latent_sums(build_index(hinge, gamma, w, v, activation_cut=0.01), points[:0])
+    )
 
 
 @pytest.mark.parametrize("spread", [0.0, 0.1, 30.0, 1e6])
@@ -89,7 +102,7 @@ def test_groups_hold_every_point_once_and_stay_small(n: int, spread: float) -> N
     assert cuts[0] == 0
     assert cuts[-1] == n
     assert (np.diff(cuts) > 0).all()
-    widest = max(np.ptp(points[order[a:b]], axis=0).max() for a, b in zip(cuts[:-1], cuts[1:], strict=True))
+    widest = max(np.ptp(points[order[a:b]], axis=0).max() for a, b in itertools.pairwise(cuts))
     assert widest <= max(2.0 * 1.5 * 1.8, 10 * spread / 2**20)
 
 

@@ -47,7 +47,11 @@ def test_hinges_that_are_not_finite_are_refused() -> None:
 
 
 def test_row_vectors_and_columns_are_taken_as_the_authors_ship_them() -> None:
-    shaped = {k: np.reshape(v, (1, 2)) if k == "gamma" else np.reshape(v, (2, 1)) for k, v in GOOD.items() if k != "hinge_points"}
+    shaped = {
+        k: np.reshape(v, (1, 2)) if k == "gamma" else np.reshape(v, (2, 1))
+        for k, v in GOOD.items()
+        if k != "hinge_points"
+    }
     one = KernelMap.from_arrays(**GOOD).occupancy([[0.5, 0, 0]])
     other = KernelMap.from_arrays(GOOD["hinge_points"], **shaped).occupancy([[0.5, 0, 0]])
     np.testing.assert_array_equal(one.mean, other.mean)
@@ -116,7 +120,13 @@ def test_a_map_ignores_later_changes_of_the_callers_arrays() -> None:
 
 def test_many_threads_may_ask_at_once() -> None:
     rng = np.random.default_rng(0)
-    kernels = KernelMap.from_arrays(rng.uniform(-9, 9, (3000, 3)), rng.uniform(0.1, 4, 3000), rng.normal(size=3000), np.ones(3000), threads=2)
+    kernels = KernelMap.from_arrays(
+        rng.uniform(-9, 9, (3000, 3)),
+        rng.uniform(0.1, 4, 3000),
+        rng.normal(size=3000),
+        np.ones(3000),
+        threads=2,
+    )
     points = rng.uniform(-9, 9, (2000, 3))
     truth = kernels.occupancy(points).mean
     answers: list[np.ndarray] = [np.empty(0)] * 6

@@ -179,7 +179,9 @@ def test_a_solve_cut_short_says_so() -> None:
 
 
 @pytest.mark.parametrize(("prior_mean", "prior_var", "n"), [(0.0, 4.0, 30), (1.5, 0.5, 12)])
-def test_log_evidence_of_one_weight_agrees_with_integration(prior_mean: float, prior_var: float, n: int) -> None:
+def test_log_evidence_of_one_weight_agrees_with_integration(
+    prior_mean: float, prior_var: float, n: int
+) -> None:
     rng = np.random.default_rng(n)
     phi = rng.uniform(0.2, 1.0, (n, 1))
     y = rng.random(n) < 0.7
@@ -202,7 +204,11 @@ def test_the_evidence_prefers_a_prior_that_fits() -> None:
 
 def test_features_may_be_given_as_they_are() -> None:
     """Two points, one kernel, done by hand: w solves 2 (sigmoid(w) - 1/2) + w - 1 = 0 with labels 0 and 1."""
-    features = SparseFeatures(np.arange(2), np.array([0, 1, 2]), np.zeros(2, np.int32), np.ones(2, np.float32))
-    fitted = fit_sparse(features, np.array([True, False]), np.ones(1, np.float32), np.ones(1, np.float32), tolerance=1e-7)
+    features = SparseFeatures(
+        np.arange(2), np.array([0, 1, 2]), np.zeros(2, np.int32), np.ones(2, np.float32)
+    )
+    fitted = fit_sparse(
+        features, np.array([True, False]), np.ones(1, np.float32), np.ones(1, np.float32), tolerance=1e-7
+    )
     w = float(fitted.mean[0])
     assert 2 * (expit(w) - 0.5) + w - 1.0 == pytest.approx(0.0, abs=1e-5)

@@ -50,11 +50,15 @@ def test_a_sector_equal_to_an_atom_gets_it_unturned(settings: MappingSettings) -
 
 def test_a_failed_solve_cannot_win() -> None:
     settings = dataclasses.replace(PAPER, rank_iterations=1, rank_tolerance=1e-9, rank_reg_m2=0.05)
-    assert _matcher(settings, reference.atom("a", HITS, FREE)).match([reference.sector(HITS * 2, FREE)]) == [None]
+    assert _matcher(settings, reference.atom("a", HITS, FREE)).match([reference.sector(HITS * 2, FREE)]) == [
+        None
+    ]
 
 
 @pytest.mark.parametrize("settings", SETTINGS, ids=lambda s: s.profile)
-def test_the_choice_depends_on_neither_threads_nor_the_company_of_other_sectors(settings: MappingSettings) -> None:
+def test_the_choice_depends_on_neither_threads_nor_the_company_of_other_sectors(
+    settings: MappingSettings,
+) -> None:
     atoms = [reference.atom(f"a{i}", HITS * s, FREE * s) for i, s in enumerate((0.6, 1.0, 1.5))]
     sectors = [reference.sector(HITS * s, FREE) for s in (0.7, 1.1, 1.4)]
     together = _matcher(settings, *atoms).match(sectors)
@@ -62,4 +66,8 @@ def test_the_choice_depends_on_neither_threads_nor_the_company_of_other_sectors(
     for one, other in zip(together, threaded, strict=True):
         assert one is not None
         assert other is not None
-        assert (one.atom.atom_id, one.rotation_rad, one.w2_m2) == (other.atom.atom_id, other.rotation_rad, other.w2_m2)
+        assert (one.atom.atom_id, one.rotation_rad, one.w2_m2) == (
+            other.atom.atom_id,
+            other.rotation_rad,
+            other.w2_m2,
+        )

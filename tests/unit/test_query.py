@@ -116,7 +116,9 @@ def test_a_flat_box_is_one_layer(query: QueryService) -> None:
         ([0, 0, 0], [10, 10, 10], 1e-320, TooLargeError),
     ],
 )
-def test_bad_grids(query: QueryService, lower: list, upper: list, resolution: float, error: type[Exception]) -> None:
+def test_bad_grids(
+    query: QueryService, lower: list, upper: list, resolution: float, error: type[Exception]
+) -> None:
     with pytest.raises(error):
         query.grid(lower, upper, resolution)
 

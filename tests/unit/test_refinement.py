@@ -10,7 +10,14 @@ import pytest
 from potserver.domain.kernel_map import KernelMap
 from potserver.domain.types import KernelSet
 from potserver.numerics.beams import LabelledPoints
-from potserver.services.refinement import activation, fill_kernels, gamma_of_spacing, is_fine, place_kernels, refine
+from potserver.services.refinement import (
+    activation,
+    fill_kernels,
+    gamma_of_spacing,
+    is_fine,
+    place_kernels,
+    refine,
+)
 from potserver.services.settings import MappingSettings
 
 SETTINGS = MappingSettings()
@@ -35,7 +42,9 @@ def test_one_kernel_in_every_occupied_voxel(offset: float) -> None:
     kernels = place_kernels(points, 0.5, 9.0)
     cells = np.unique(np.floor(points / 0.5), axis=0)
     placed = kernels.hinge_mean / 0.5 - 0.5
-    np.testing.assert_allclose(placed[np.lexsort(placed.T[::-1])], cells[np.lexsort(cells.T[::-1])], atol=1e-6)
+    np.testing.assert_allclose(
+        placed[np.lexsort(placed.T[::-1])], cells[np.lexsort(cells.T[::-1])], atol=1e-6
+    )
     np.testing.assert_array_equal(kernels.weight_mean, 0.0)
     np.testing.assert_array_equal(kernels.weight_var, 9.0)
     np.testing.assert_allclose(kernels.gamma, gamma_of_spacing(0.5), rtol=1e-5)
@@ -68,7 +77,9 @@ def test_filling_switched_off() -> None:
     off = dataclasses.replace(SETTINGS, fill_coarse_m=0.0, fill_fine_m=0.0)
     assert len(fill_kernels(_labelled(), KernelSet.empty(), off, threads=1)) == 0
     coarse_only = dataclasses.replace(SETTINGS, fill_fine_m=0.0)
-    assert not is_fine(fill_kernels(_labelled(), KernelSet.empty(), coarse_only, threads=1), coarse_only).any()
+    assert not is_fine(
+        fill_kernels(_labelled(), KernelSet.empty(), coarse_only, threads=1), coarse_only
+    ).any()
 
 
 def test_activation_is_the_sum_of_phi() -> None:
@@ -111,7 +122,11 @@ def test_a_surer_prior_moves_less() -> None:
     labelled = _labelled()
     placed = fill_kernels(labelled, KernelSet.empty(), SETTINGS, threads=1)
     moved = [
-        float(np.abs(_refine(placed.replace(weight_var=np.full(len(placed), v, np.float32)), labelled).weight_mean).mean())
+        float(
+            np.abs(
+                _refine(placed.replace(weight_var=np.full(len(placed), v, np.float32)), labelled).weight_mean
+            ).mean()
+        )
         for v in (0.01, 1.0, 100.0)
     ]
     assert moved[0] < moved[1] < moved[2]

@@ -10,7 +10,11 @@ import pytest
 from potserver.errors import SettingsError
 from potserver.services.settings import PAPER, PROFILES, MappingSettings, RankScore
 
-NUMBERS = [f.name for f in dataclasses.fields(MappingSettings) if isinstance(f.default, int | float) and not isinstance(f.default, bool)]
+NUMBERS = [
+    f.name
+    for f in dataclasses.fields(MappingSettings)
+    if isinstance(f.default, int | float) and not isinstance(f.default, bool)
+]
 
 
 def test_profiles_by_name() -> None:

@@ -57,7 +57,10 @@ def test_label_aware_moves_free_space_with_the_free_points() -> None:
     up = np.float32([0, 0, 2.0])
     sector = _wide(HITS, FREE + up)
     occupied = ATOM.kernels.weight_mean > 0
-    aware = _transport(sector, dataclasses.replace(PAPER, label_aware=True)).kernels.hinge_mean - ATOM.kernels.hinge_mean
+    aware = (
+        _transport(sector, dataclasses.replace(PAPER, label_aware=True)).kernels.hinge_mean
+        - ATOM.kernels.hinge_mean
+    )
     blind = _transport(sector).kernels.hinge_mean - ATOM.kernels.hinge_mean
     np.testing.assert_allclose(blind, 0.0, atol=0.05)
     np.testing.assert_allclose(aware[occupied], 0.0, atol=0.05)

@@ -109,7 +109,9 @@ def test_gamma_is_the_mean_of_its_distribution() -> None:
 
 def test_taking_and_joining_keep_all_ten_numbers() -> None:
     kernels = _kernels()
-    back = KernelSet.concatenate([kernels.take(slice(0, 2)), kernels.take(np.array([2, 3])), kernels.take(np.arange(5) == 4)])
+    back = KernelSet.concatenate(
+        [kernels.take(slice(0, 2)), kernels.take(np.array([2, 3])), kernels.take(np.arange(5) == 4)]
+    )
     for field in dataclasses.fields(KernelSet):
         np.testing.assert_array_equal(getattr(back, field.name), getattr(kernels, field.name))
         assert getattr(back, field.name).dtype == getattr(kernels, field.name).dtype
