@@ -35,12 +35,16 @@ def surface(n: int, seed: int) -> np.ndarray[Any, np.dtype[np.float32]]:
 def test_ranking(benchmark: Any, n: int, threads: int) -> None:
     """5 sectors x 6 atoms x 8 turns, one label: 240 couplings."""
     atoms = [surface(n, seed) for seed in range(6)]
-    sources = Ragged.of([(a @ rotation_z(k * np.pi / 4).T).astype(np.float32) for a in atoms for k in range(8)])
+    sources = Ragged.of(
+        [(a @ rotation_z(k * np.pi / 4).T).astype(np.float32) for a in atoms for k in range(8)]
+    )
     targets = Ragged.of([surface(n, 100 + seed) for seed in range(5)])
     pairs = np.stack(np.meshgrid(np.arange(48), np.arange(5), indexing="ij"), axis=-1).reshape(-1, 2)
     solved = benchmark(coupling_costs, sources, targets, pairs, reg=12.5, tolerance=1e-4, threads=threads)
     assert solved.converged.all()
-    benchmark.extra_info.update(n=n, pairs=len(pairs), threads=threads, iterations=float(solved.n_iterations.mean()))
+    benchmark.extra_info.update(
+        n=n, pairs=len(pairs), threads=threads, iterations=float(solved.n_iterations.mean())
+    )
 
 
 def test_ranking_by_the_pot_library(benchmark: Any) -> None:
@@ -56,7 +60,9 @@ def test_final_coupling(benchmark: Any, n: int) -> None:
     """The authors' final setting: reg .0005 of the largest cost."""
     solved = benchmark(couple, surface(n, 0), surface(n, 1), reg=0.0005, tolerance=1e-4, max_iterations=4000)
     assert solved.converged
-    benchmark.extra_info.update(n=n, threads=1, iterations=solved.n_iterations, marginal_error=solved.marginal_error)
+    benchmark.extra_info.update(
+        n=n, threads=1, iterations=solved.n_iterations, marginal_error=solved.marginal_error
+    )
 
 
 def test_final_coupling_by_the_pot_library(benchmark: Any) -> None:
@@ -66,7 +72,14 @@ def test_final_coupling_by_the_pot_library(benchmark: Any) -> None:
 
     def solve() -> Any:
         return ot.sinkhorn(
-            weights, weights, cost / cost.max(), 0.0005, method="sinkhorn", stopThr=1e-7, numItermax=2000, warn=False
+            weights,
+            weights,
+            cost / cost.max(),
+            0.0005,
+            method="sinkhorn",
+            stopThr=1e-7,
+            numItermax=2000,
+            warn=False,
         )
 
     benchmark.pedantic(solve, rounds=1)
@@ -90,7 +103,7 @@ def test_queries(benchmark: Any, n_queries: int, threads: int) -> None:
     rng = np.random.default_rng(1)
     points = hinge[rng.integers(0, len(hinge), n_queries)] + rng.normal(0, 0.5, (n_queries, 3))
     benchmark(kernel_map.occupancy, points)
-    benchmark.extra_info.update(kernels=100_000, queries=n_queries, threads=threads, tau=kernel_map.tau)
+    benchmark.extra_info.update(kernels=100_000, queries=n_queries, threads=threads)
 
 
 def test_index(benchmark: Any) -> None:

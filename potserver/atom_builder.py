@@ -17,7 +17,7 @@ from potserver import bundled
 from potserver.domain.dictionary import AtomDictionary
 from potserver.domain.kernel_map import KernelMap
 from potserver.domain.types import Atom, Scan
-from potserver.errors import DictionaryError, EmptyError
+from potserver.errors import DictionaryError, EmptyError, SolverError
 from potserver.numerics.geometry import in_sector, rotation_z, yaw_of
 from potserver.services.learning import LearningSettings, choose_diverse, learn_atoms
 
@@ -76,6 +76,11 @@ def run(options: argparse.Namespace) -> AtomDictionary:
     """
     if options.builtin == bool(options.datasets):
         raise DictionaryError("name recordings to learn from, or --builtin, and not both")
+    if options.atoms < 1 or options.scans < 1:
+        raise DictionaryError("--atoms and --scans must be at least 1")
+    names = [_name_of(path) for path in options.datasets]
+    if len(set(names)) < len(names):
+        raise DictionaryError(f"the recordings' names must differ, got {', '.join(names)}")
     atoms: list[Atom] = []
     try:
         if options.builtin:
@@ -91,13 +96,19 @@ def run(options: argparse.Namespace) -> AtomDictionary:
             )
             for path in options.datasets:
                 recording = open_dataset(path)[: options.scans]
-                name = Path(path).stem.lower().replace("_", "-")
+                name = _name_of(path)
                 atoms += _learn_recording(recording, name, settings, options.licence, options.atoms)
-    except (DatasetError, EmptyError) as error:
+    except (DatasetError, EmptyError, SolverError) as error:
         raise DictionaryError(str(error)) from error
     dictionary = AtomDictionary(tuple(atoms))
     dictionary.save(options.out)
     return dictionary
+
+
+def _name_of(path: str) -> str:
+    """A prefix for atom ids: the last two parts of the path, e.g. `kitti-00`."""
+    parts = Path(path).resolve().with_suffix("").parts[-2:]
+    return "-".join(parts).lower().replace("_", "-").replace(" ", "-")
 
 
 def _learn_recording(

@@ -45,6 +45,7 @@ class IntakeSettings:
     retry_after_s: float = 0.5  # advice to senders that were refused for load
     robots: tuple[str, ...] = ()  # allow list; empty allows every legal id
     allow_old_stamps: bool = False  # take clouds that are not newer than the robot's last accepted one
+    max_future_s: float = 5.0  # clouds and poses stamped further ahead of our clock are refused
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)

@@ -57,7 +57,7 @@ class OutOfRangeError(PotserverError):
 
 
 class OldStampError(PotserverError):
-    """The stamp is not newer than the last accepted cloud of this robot."""
+    """The stamp is not newer than the last accepted cloud of this robot, or too far in the future."""
 
     code = "old_stamp"
 
@@ -94,7 +94,7 @@ class OverloadedError(PotserverError):
 
 
 class DeadlineError(PotserverError):
-    """The asker's deadline passed before the work could start."""
+    """The asker's deadline passed before the work was done."""
 
     code = "deadline"
     retryable = True
@@ -109,6 +109,12 @@ class ShuttingDownError(PotserverError):
 
 class DictionaryError(PotserverError):
     """An atom dictionary file is missing, damaged, or of another version."""
+
+    code = "internal"
+
+
+class SolverError(PotserverError):
+    """A numerical solve ended without a usable result."""
 
     code = "internal"
 

@@ -224,12 +224,11 @@ class MapServer:
             node.withdraw()
         # subscribers live on through the drain, so that whoever still sends is told
         drained = [node.drain(deadline) for node in nodes]
-        if self._pool is not None:
-            self._pool.close(_FLUSH_S)
+        answered = self._pool is None or self._pool.close(_FLUSH_S)
         if self._stats is not None:
             self._stats.close()
         ended = [node.close() for node in nodes]
-        clean = all([*drained, *ended, close_session(session, _CLOSE_S)])
+        clean = all([*drained, answered, *ended, close_session(session, _CLOSE_S)])
         self._session = None
         log.info("server_stopped", clean=clean, counters=self.health.counters())
         return clean
@@ -274,7 +273,10 @@ class _MapNode:
             bulk=self.bulk,
         )
         poses = PoseBuffer(
-            max_per_robot=s.poses.max_per_robot, max_robots=s.limits.max_robots, max_gap_s=s.poses.max_gap_s
+            max_per_robot=s.poses.max_per_robot,
+            max_robots=s.limits.max_robots,
+            max_gap_s=s.poses.max_gap_s,
+            max_future_s=s.intake.max_future_s,
         )
         self._writer = MapWriter(
             map_id,
@@ -286,6 +288,7 @@ class _MapNode:
             limits=s.limits,
             allowed_robots=allowed,
             allow_old_stamps=s.intake.allow_old_stamps,
+            max_future_s=s.intake.max_future_s,
             pose_wait_s=s.poses.wait_s,
         )
         self._writer_thread = spawn(f"{map_id}-writer", self._writer.run)
@@ -306,7 +309,7 @@ class _MapNode:
                 started_ns=health.started_ns,
             )
 
-        self.robots = RobotWatch(session, self._keys, max_robots=s.limits.max_robots)
+        self.robots = RobotWatch(session, self._keys, health=health, max_robots=s.limits.max_robots)
         self._declarations: list[_Declaration] = [
             self.robots,
             PoseSubscriber(session, self._keys, poses=poses, health=health, allowed_robots=allowed),

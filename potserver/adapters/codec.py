@@ -362,6 +362,7 @@ def accepted_receipt(
             n_points=int(update.n_points),
             n_kernels=len(update.kernels),
             n_kernels_added=int(update.n_kernels_added),
+            n_kernels_transported=int(update.n_kernels_transported),
             map_kernels=int(update.map_kernels),
             sectors=_sectors(update.sectors),
             kernels=kernels,

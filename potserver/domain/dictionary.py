@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from potserver.domain.types import Atom, KernelSet
-from potserver.errors import DictionaryError, ShapeError, UnknownAtomError
+from potserver.errors import BadPointsError, DictionaryError, EmptyError, ShapeError, UnknownAtomError
 
 FORMAT = "potserver-atoms"
 FORMAT_VERSION = 1
@@ -135,5 +135,5 @@ class AtomDictionary:
                     for i, entry in enumerate(header["atoms"])
                 )
             )
-        except (KeyError, TypeError, ShapeError) as error:
+        except (KeyError, TypeError, ShapeError, BadPointsError, EmptyError) as error:
             raise DictionaryError(f"{path}: an atom is incomplete: {error}") from error

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from potserver.domain.types import AnswerRule, Float64, KernelSet, Occupancy
+from potserver.domain.types import AnswerRule, Float32, Float64, KernelSet, Occupancy
 from potserver.errors import BadPointsError, ShapeError
 from potserver.numerics import kernel_index
 from potserver.numerics.occupancy import predict_occupancy
@@ -13,8 +13,8 @@ from potserver.numerics.threads import default_threads
 
 # A point whose kernels sum to less activation than this is unobserved: nothing near it was ever seen.
 OBSERVED_ACTIVATION = 0.05
-# Variance of the latent where nothing is known, log-odds^2; the prior of the weights (see numerics.logistic).
-PRIOR_VAR = 100.0
+# Variance of the latent where nothing is known, log-odds^2: a standard deviation of 7, anything from sure to sure.
+PRIOR_VAR = 50.0
 
 
 class KernelMap:
@@ -29,9 +29,8 @@ class KernelMap:
         residual_var: float = 0.0,
         map_revision: int = 0,
         threads: int | None = None,
-        tau: float | None = None,
     ) -> None:
-        """Index the kernels.
+        """Index the kernels. Answers use the mean of every hinge and every gamma; their dispersions are only kept.
 
         Args:
             kernels: In the map frame; gamma enters by its mean.
@@ -42,7 +41,6 @@ class KernelMap:
                 the farther it is from all data.
             map_revision: Carried into the answers.
             threads: Threads a query may use; all processors by default.
-            tau: Support cut, if it was measured on a similar map before; see `numerics.kernel_index`.
         """
         self.kernels = kernels
         self.rule = AnswerRule(observed_activation, prior_var, residual_var)
@@ -54,7 +52,6 @@ class KernelMap:
             kernels.weight_mean.astype(np.float64),
             kernels.weight_var.astype(np.float64),
             activation_cut=observed_activation / 20.0,
-            tau=tau,
         )
 
     @classmethod
@@ -67,6 +64,7 @@ class KernelMap:
         *,
         observed_activation: float = OBSERVED_ACTIVATION,
         prior_var: float = PRIOR_VAR,
+        residual_var: float = 0.0,
         threads: int | None = None,
     ) -> KernelMap:
         """A map from bare arrays, hinges and gammas without dispersion.
@@ -76,6 +74,7 @@ class KernelMap:
             gamma: (K,) 1/m^2, > 0.
             weight_mean: (K,) log-odds.
             weight_var: (K,) log-odds^2, >= 0; a variance, not a standard deviation.
+            observed_activation, prior_var, residual_var, threads: As in the constructor.
         Raises:
             ShapeError: the arrays disagree on K, or gamma or a variance has an illegal sign, or something is not finite.
         """
@@ -85,29 +84,28 @@ class KernelMap:
             raise ShapeError(
                 f"{len(hinge)} hinge points, {len(g)} gammas, {len(w)} means, {len(v)} variances: K differs"
             )
-        if not (np.isfinite(w).all() and np.isfinite(v).all() and np.isfinite(g).all()):
-            raise ShapeError("gamma, weight_mean and weight_var must be finite")
-        if (g <= 0).any() or (v < 0).any():
-            raise ShapeError("gamma must be > 0 and weight_var >= 0")
         # a Gamma distribution of shape 1 / rel_var; as sharp as float32 tells apart
         shape = np.full(len(g), 1e6)
+        with np.errstate(over="ignore", divide="ignore"):
+            rate = (shape / g).astype(np.float32)
         kernels = KernelSet(
             hinge_mean=hinge,
             hinge_var=np.zeros((len(hinge), 3), np.float32),
             gamma_shape=shape.astype(np.float32),
-            gamma_rate=(shape / g).astype(np.float32),
-            weight_mean=w.astype(np.float32),
-            weight_var=v.astype(np.float32),
+            gamma_rate=rate,
+            weight_mean=_float32(w),
+            weight_var=_float32(v),
         )
-        return cls(kernels, observed_activation=observed_activation, prior_var=prior_var, threads=threads)
+        return cls(
+            kernels,
+            observed_activation=observed_activation,
+            prior_var=prior_var,
+            residual_var=residual_var,
+            threads=threads,
+        )
 
     def __len__(self) -> int:
         return len(self.kernels)
-
-    @property
-    def tau(self) -> float:
-        """The support cut of the index, to hand to the next revision."""
-        return self._index.tau
 
     def occupancy(self, points: ArrayLike) -> Occupancy:
         """Mean and variance of the occupancy probability, and of the latent, anywhere.
@@ -142,7 +140,7 @@ class KernelMap:
 
     def latent(self, points: Float64) -> kernel_index.LatentSums:
         """The bare sums of eq. 1 at (N, 3) points, with no rule for unobserved ones."""
-        return kernel_index.latent_sums(self._index, points, threads=self._threads)
+        return kernel_index.latent_sums(self._index, points, threads=self._threads, lane="query")
 
 
 def as_points(points: ArrayLike) -> Float64:
@@ -160,3 +158,8 @@ def as_points(points: ArrayLike) -> Float64:
     if array.shape[1] == 2:
         array = np.concatenate([array, np.zeros((len(array), 1))], axis=1)
     return np.ascontiguousarray(array)
+
+
+def _float32(values: Float64) -> Float32:
+    with np.errstate(over="ignore"):  # what overflows is refused as infinite
+        return values.astype(np.float32)

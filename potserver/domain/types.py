@@ -21,19 +21,28 @@ class Scan:
     """One LiDAR sweep with its pose.
 
     Raises (on construction):
-        ShapeError, BadPointsError, EmptyError, BadPoseError: see `__post_init__`.
+        ShapeError: points are not (N, 3), is_return not (N,), or the pose not (4, 4).
+        EmptyError: no points. BadPointsError: NaN or infinite coordinates, or a planar scan out of its plane.
+        BadPoseError: the pose is not rigid.
     """
 
-    robot_id: str
-    seq: int
-    stamp_ns: int
     points: Float32  # (N, 3) m, sensor frame: echoes, and ends of beams without one
-    is_return: Bool  # (N,) false = no echo, the beam was free up to the point
     T_map_sensor: Float64  # (4, 4) rigid
-    is_planar: bool = False  # a 2D scanner: everything has z = 0 in the map frame
+    is_return: Bool = None  # type: ignore[assignment]  # (N,) false = no echo, the beam was free up to the point; all by default
+    is_planar: bool = False  # a 2D scanner: everything has z = 0
+    robot_id: str = "robot"
+    seq: int = 0
+    stamp_ns: int = 0
 
     def __post_init__(self) -> None:
         n = len(self.points)
+        returned = np.ones(n, bool) if self.is_return is None else self.is_return
+        for name, value, dtype in (
+            ("points", self.points, np.float32),
+            ("is_return", returned, np.bool_),
+            ("T_map_sensor", self.T_map_sensor, np.float64),
+        ):
+            object.__setattr__(self, name, np.ascontiguousarray(value, dtype))
         if self.points.shape != (n, 3) or self.is_return.shape != (n,) or self.T_map_sensor.shape != (4, 4):
             raise ShapeError(
                 f"scan: points {self.points.shape}, is_return {self.is_return.shape}, pose {self.T_map_sensor.shape};"
@@ -45,6 +54,8 @@ class Scan:
             bad = int((~np.isfinite(self.points)).any(axis=1).sum())
             raise BadPointsError(f"{bad} of {n} points have NaN or infinite coordinates")
         check_rigid(self.T_map_sensor)
+        if self.is_planar and self.points[:, 2].any():
+            raise BadPointsError("a planar scan has points with z other than 0")
 
     @property
     def origin(self) -> Float64:
@@ -75,7 +86,11 @@ def check_rigid(transform: Float64, tolerance: float = 1e-3) -> None:
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class KernelSet:
-    """K kernels of a Bayesian Hilbert map in one frame: ten numbers each (paper, section II-A)."""
+    """K kernels of a Bayesian Hilbert map in one frame: ten numbers each (paper, section II-A). Read-only arrays.
+
+    Raises (on construction):
+        ShapeError: the arrays disagree on K, are not finite, or gamma or a variance has an illegal sign.
+    """
 
     hinge_mean: Float64  # (K, 3) m; float64, because maps live at UTM coordinates
     hinge_var: Float32  # (K, 3) m^2, along the frame's axes
@@ -94,8 +109,18 @@ class KernelSet:
             ("weight_mean", (k,)),
             ("weight_var", (k,)),
         ):
-            if getattr(self, name).shape != shape:
-                raise ShapeError(f"{name}: {getattr(self, name).shape}, need {shape}")
+            array = getattr(self, name)
+            if array.shape != shape:
+                raise ShapeError(f"{name}: {array.shape}, need {shape}")
+            if not np.isfinite(array).all():
+                raise ShapeError(f"{name}: NaN or infinite values")
+            view = array.view()
+            view.flags.writeable = False  # kernels are shared between threads
+            object.__setattr__(self, name, view)
+        if (self.gamma_shape <= 0).any() or (self.gamma_rate <= 0).any():
+            raise ShapeError("gamma_shape and gamma_rate must be > 0")
+        if (self.weight_var < 0).any() or (self.hinge_var < 0).any():
+            raise ShapeError("variances must be >= 0")
 
     def __len__(self) -> int:
         return len(self.hinge_mean)
@@ -151,6 +176,18 @@ class Atom:
     radius_m: float
     azimuth_width_rad: float
     provenance: dict[str, str]
+
+    def __post_init__(self) -> None:
+        for name in ("hit_points", "free_points"):
+            points = getattr(self, name)
+            if points.ndim != 2 or points.shape[1] != 3:
+                raise ShapeError(f"atom {self.atom_id}: {name} has shape {points.shape}, need (N, 3)")
+            if not np.isfinite(points).all():
+                raise BadPointsError(f"atom {self.atom_id}: {name} has NaN or infinite coordinates")
+        if len(self.hit_points) + len(self.free_points) == 0:
+            raise EmptyError(f"atom {self.atom_id} has no points: nothing could be matched to it")
+        if self.dims not in (2, 3):
+            raise ShapeError(f"atom {self.atom_id}: {self.dims} dimensions, need 2 or 3")
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -222,8 +259,13 @@ class MapUpdate:
     kernels: KernelSet  # the instantaneous map, map frame
     sectors: list[SectorMatch]
     n_points: int  # beams used
-    n_kernels_added: int
+    n_kernels_added: int  # that the overall map took, of both kinds
+    n_kernels_transported: (
+        int  # of those, carried from atoms; the others were placed where nothing explained the data
+    )
     map_kernels: int
+    converged: bool  # both joint solves reached their tolerance; if not, the weights are the best found
+    rule: AnswerRule  # what turns `kernels` into answers
     changed: TileChange
     timings_ms: dict[str, float]  # per stage of the pipeline
 

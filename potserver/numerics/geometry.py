@@ -31,11 +31,6 @@ def yaw_of(T_map_sensor: Float64) -> float:
     return math.atan2(T_map_sensor[1, 0], T_map_sensor[0, 0])
 
 
-def wrap_angle(angle_rad: NDArray[np.floating]) -> NDArray[np.floating]:
-    """The same angles in [-pi, pi)."""
-    return (angle_rad + np.pi) % (2.0 * np.pi) - np.pi
-
-
 def sector_edges(n_sectors: int) -> Float64:
     """(n_sectors + 1,) rad: equal cylindrical sectors about the sensor, the first one centred on its heading."""
     width = 2.0 * math.pi / n_sectors
@@ -75,8 +70,11 @@ def voxel_pick(points: NDArray[np.floating], voxel_m: float) -> NDArray[np.intp]
 def thin(
     points: NDArray[np.floating], n_max: int, voxel_m: float, rng: np.random.Generator
 ) -> NDArray[np.intp]:
-    """Numbers of at most `n_max` points that cover the set: one a voxel, then a random choice among those."""
-    picked = voxel_pick(points, voxel_m)
+    """Numbers of at most `n_max` points that cover the set: one a voxel, then a random choice among those.
+
+    A voxel of 0 leaves the voxels out: a plain random choice.
+    """
+    picked = voxel_pick(points, voxel_m) if voxel_m > 0 else np.arange(len(points))
     if len(picked) > n_max:
         picked = np.sort(rng.choice(picked, n_max, replace=False))
     return picked

@@ -166,11 +166,13 @@ class LatentSums(NamedTuple):
     activation: Float32  # (N,) sum of phi
 
 
-def latent_sums(index: KernelIndex, points: Float64, *, threads: int = 1) -> LatentSums:
+def latent_sums(index: KernelIndex, points: Float64, *, threads: int = 1, lane: str = "map") -> LatentSums:
     """Evaluate the kernels of an index.
 
     Args:
         points: (N, 3) float64, m, same frame as the hinges.
+        threads: Threads to spread the points over.
+        lane: See `threads.parallel_map`.
     Source: paper eq. 1; variance of a factorised posterior.
     """
     n = len(points)
@@ -187,7 +189,7 @@ def latent_sums(index: KernelIndex, points: Float64, *, threads: int = 1) -> Lat
             index.level_cell, index.level_size, index.keys, sums,
         )  # fmt: skip
 
-    parallel_map(run, spans(len(cuts) - 1, 16 * threads if threads > 1 else 1), threads)
+    parallel_map(run, spans(len(cuts) - 1, 16 * threads if threads > 1 else 1), threads, lane)
     out[:, order] = sums
     return LatentSums(*out)
 

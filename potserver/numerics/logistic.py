@@ -14,7 +14,6 @@ from typing import NamedTuple
 
 import numba as nb
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from potserver.numerics.fastexp import FAST
@@ -27,6 +26,9 @@ Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
 
 
+_BLOCKS = 4
+
+
 class WeightPosterior(NamedTuple):
     """Gaussian over the weights at the maximum of the posterior (Laplace), and how the solve ended."""
 
@@ -34,7 +36,7 @@ class WeightPosterior(NamedTuple):
     var: Float32  # (K,) log-odds^2: 1 / diagonal of the Hessian, the variance of each weight given the others
     n_newton: int
     n_conjugate_gradient: int
-    gradient_norm: float  # at the result, relative to its norm at the start
+    gradient_norm: float  # when it was last looked at, relative to its norm at the start
     converged: bool
 
 
@@ -71,7 +73,7 @@ def fit_sparse(
     base = np.zeros(n, np.float32) if offset is None else offset[order].astype(np.float32)
     count = np.ones(n, np.float32) if sample_weight is None else sample_weight[order].astype(np.float32)
     precision = (1.0 / prior_var).astype(np.float32)
-    rows = spans(n, threads)
+    rows = spans(n, _BLOCKS)  # not `threads`: the sums, and so the map, must not depend on the machine
 
     def latent(weights: Float32) -> Float32:
         out = np.empty(n, np.float32)
@@ -256,12 +258,14 @@ def fit_dense(
         device: Where torch computes.
     Source: Laplace approximation of Bayesian logistic regression, MacKay 1992.
     """
+    import torch  # here and not above: it takes seconds to load, and only learning needs it
+
     phi = torch.as_tensor(features, dtype=torch.float64, device=device)
     y = torch.as_tensor(labels, device=device).to(torch.float64)
     mean0 = torch.as_tensor(prior_mean, dtype=torch.float64, device=device)
     precision = 1.0 / torch.as_tensor(prior_var, dtype=torch.float64, device=device)
 
-    def objective(w: torch.Tensor) -> torch.Tensor:
+    def objective(w):
         f = phi @ w
         loss = torch.nn.functional.softplus(f) - y * f
         return loss.sum() + 0.5 * (precision * (w - mean0).square()).sum()

@@ -22,16 +22,19 @@ def default_threads() -> int:
 
 
 @cache
-def _pool(threads: int) -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(threads, thread_name_prefix="numerics")
+def _pool(threads: int, lane: str) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(threads, thread_name_prefix=f"numerics-{lane}")
 
 
-def parallel_map(function: Callable[[T], R], items: Iterable[T], threads: int) -> list[R]:
-    """`[function(i) for i in items]`, in order, on `threads` threads; an error of any item is raised."""
+def parallel_map(function: Callable[[T], R], items: Iterable[T], threads: int, lane: str = "map") -> list[R]:
+    """`[function(i) for i in items]`, in order, on `threads` threads; an error of any item is raised.
+
+    Work of one lane never waits behind work of another: each has threads of its own.
+    """
     work = list(items)
     if threads <= 1 or len(work) <= 1:
         return [function(item) for item in work]
-    return list(_pool(threads).map(function, work))
+    return list(_pool(threads, lane).map(function, work))
 
 
 def spans(n: int, parts: int) -> list[tuple[int, int]]:

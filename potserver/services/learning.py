@@ -9,12 +9,11 @@ import numpy as np
 
 from potserver.domain.dictionary import AtomDictionary
 from potserver.domain.types import Atom, Float32, Float64, KernelSet, Scan
-from potserver.errors import EmptyError, SettingsError
+from potserver.errors import EmptyError, SettingsError, SolverError
 from potserver.numerics.beams import Beams, label_beams, limit_range
 from potserver.numerics.coupling import Ragged, coupling_costs
 from potserver.numerics.geometry import in_sector, rotation_z, sector_edges, thin, yaw_of
 from potserver.numerics.logistic import fit_dense
-from potserver.services.matching import centre_of
 from potserver.services.refinement import place_kernels
 
 
@@ -96,7 +95,12 @@ def _learn(
     phi = np.exp(-placed.gamma.astype(np.float64) * d2)
     k = len(placed)
     fits = [(v, fit_dense(phi, occupied, np.zeros(k), np.full(k, v))) for v in settings.prior_vars]
-    prior_var, best = max(fits, key=lambda fit: fit[1].log_evidence)
+    solved = [fit for fit in fits if fit[1].converged]
+    if not solved:
+        raise SolverError(
+            f"no prior variance of {settings.prior_vars} let the weights of {k} kernels converge"
+        )
+    prior_var, best = max(solved, key=lambda fit: fit[1].log_evidence)
     kernels = placed.replace(weight_mean=best.mean.astype(np.float32), weight_var=best.var.astype(np.float32))
     return kernels, prior_var, best.log_evidence
 
@@ -132,11 +136,11 @@ def choose_diverse(atoms: list[Atom], n: int, *, threads: int = 1) -> AtomDictio
         sets = []
         for atom in atoms:
             points = points_of(atom)
-            centred = points - centre_of(atom.hit_points, atom.free_points)
+            centred = points - atom.hit_points.mean(axis=0)
             sets.append(centred[thin(centred, count, 0.4, rng)].astype(np.float32))
         packed = Ragged.of(sets)
         solved = coupling_costs(packed, packed, pairs, reg=2.0, tolerance=1e-3, threads=threads)
-        distance += solved.cost.reshape(distance.shape)
+        distance += np.where(solved.converged, solved.cost, np.inf).reshape(distance.shape)
     # the most typical atom first, then whatever is farthest from all chosen so far
     chosen = [int(distance.mean(axis=1).argmin())]
     while len(chosen) < min(n, len(atoms)):

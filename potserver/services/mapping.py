@@ -7,6 +7,7 @@ import time
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import NamedTuple
 
 import numpy as np
 
@@ -28,7 +29,7 @@ from potserver.numerics.geometry import in_sector, rotation_z, sector_edges, vox
 from potserver.numerics.kernel_index import sparse_features
 from potserver.numerics.threads import default_threads, parallel_map
 from potserver.services.matching import Match, Matcher
-from potserver.services.refinement import activation, fill_kernels, is_fine, refine
+from potserver.services.refinement import Refined, activation, fill_kernels, is_fine, refine
 from potserver.services.settings import MappingSettings
 from potserver.services.transport import Transported, transport
 
@@ -92,33 +93,36 @@ class MappingService:
                 prior = carried.replace(
                     weight_var=carried.weight_var + np.float32(self.settings.borrowed_var)
                 )
-                instantaneous = self._refine(prior, in_map, self.settings.instant_tolerance)
+                instantaneous, solved = self._refine(prior, in_map, self.settings.instant_tolerance)
             with clock("fuse"):
-                kernels, added = self._fuse(prior, in_map)
+                fused = self._fuse(prior, in_map, rng)
         else:
-            instantaneous = carried
-            kernels, added = KernelSet.concatenate([self.snapshot.kernels, carried]), len(carried)
+            instantaneous, solved = carried, True
+            appended = KernelSet.concatenate([self.snapshot.kernels, carried])
+            fused = _Fused(appended, len(carried), len(carried), True)
         with clock("index"):
-            snapshot = self._map_of(kernels, revision=self.snapshot.map_revision + 1)
-        # nothing above changed the service; from here on nothing can fail
-        self.snapshot = snapshot
-        self.n_scans += 1
-        self.atom_usage.update(
-            m.atom.atom_id for m, t in zip(matches, transported, strict=True) if m and t and t.converged
-        )
-        return MapUpdate(
+            snapshot = self._map_of(fused.kernels, revision=self.snapshot.map_revision + 1)
+        update = MapUpdate(
             map_revision=snapshot.map_revision,
             kernels=instantaneous,
             sectors=[_report(s, m, t) for s, m, t in zip(sectors, matches, transported, strict=True)],
             n_points=len(beams.ends),
-            n_kernels_added=added,
-            map_kernels=len(kernels),
+            n_kernels_added=fused.n_added,
+            n_kernels_transported=fused.n_transported,
+            map_kernels=len(snapshot),
+            converged=solved and fused.converged,
+            rule=snapshot.rule,
             changed=self._touched(in_map.points),
             timings_ms=clock.timings_ms,
         )
+        # nothing above changed the service, and nothing below can fail
+        self.atom_usage.update(match.atom_id for match in update.sectors if match.atom_id is not None)
+        self.n_scans += 1
+        self.snapshot = snapshot
+        return update
 
     def clear(self) -> None:
-        """Forget everything; the revision goes on counting, so that readers notice."""
+        """Forget all scans; the revision and the use of atoms go on counting, so that readers notice."""
         self.snapshot = self._map_of(KernelSet.empty(), revision=self.snapshot.map_revision + 1)
         self.n_scans = 0
 
@@ -186,12 +190,8 @@ class MappingService:
 
         return parallel_map(run, range(len(sectors)), self._threads)
 
-    def _fuse(self, carried: KernelSet, labelled: LabelledPoints) -> tuple[KernelSet, int]:
-        """The overall map after a scan: kernels where the data ask for them, all weights near the scan solved jointly.
-
-        Returns:
-            All kernels, and how many of them are new.
-        """
+    def _fuse(self, carried: KernelSet, labelled: LabelledPoints, rng: np.random.Generator) -> _Fused:
+        """The overall map after a scan: kernels where the data ask for them, all weights near the scan solved jointly."""
         s = self.settings
         present = self.snapshot.kernels
         lower, upper = labelled.points.min(axis=0) - 3.0, labelled.points.max(axis=0) + 3.0
@@ -199,7 +199,7 @@ class MappingService:
         local = present.take(near)
         # a transported kernel is taken where the scan has data for it and the map has no kernel yet
         if len(carried):
-            supported = self._support(carried, labelled) >= 1.0
+            supported = self._support(carried, labelled, rng) >= 1.0
             carried = carried.take(supported)
         if len(carried) and len(local):
             present_activation = np.empty(len(carried), np.float32)
@@ -212,17 +212,18 @@ class MappingService:
             carried = carried.take(present_activation < s.explained_activation)
         filled = fill_kernels(labelled, KernelSet.concatenate([local, carried]), s, threads=self._threads)
         new = KernelSet.concatenate([carried, filled])
-        refined = self._refine(KernelSet.concatenate([local, new]), labelled, s.refine_tolerance)
-        return KernelSet.concatenate([present.take(~near), refined]), len(new)
+        refined, converged = self._refine(KernelSet.concatenate([local, new]), labelled, s.refine_tolerance)
+        everything = KernelSet.concatenate([present.take(~near), refined])
+        return _Fused(everything, len(new), len(carried), converged)
 
-    def _refine(self, kernels: KernelSet, labelled: LabelledPoints, tolerance: float) -> KernelSet:
+    def _refine(self, kernels: KernelSet, labelled: LabelledPoints, tolerance: float) -> Refined:
         cut = self.settings.feature_cut
         return refine(kernels, labelled, feature_cut=cut, tolerance=tolerance, threads=self._threads)
 
-    def _support(self, kernels: KernelSet, labelled: LabelledPoints) -> np.ndarray:
+    def _support(self, kernels: KernelSet, labelled: LabelledPoints, rng: np.random.Generator) -> np.ndarray:
         """(K,) about how many labelled points each kernel has, each counted by its activation; from one point in four."""
         features = sparse_features(
-            labelled.points[::4],
+            labelled.points[rng.random(len(labelled.points)) < 0.25],
             kernels.hinge_mean,
             kernels.gamma.astype(np.float64),
             cut=0.1,
@@ -242,6 +243,13 @@ class MappingService:
         )  # fmt: skip
 
 
+class _Fused(NamedTuple):
+    kernels: KernelSet  # of the whole map
+    n_added: int
+    n_transported: int  # of those added
+    converged: bool
+
+
 def _report(sector: Sector, match: Match | None, transported: Transported | None) -> SectorMatch:
     turn = yaw_of(sector.T_map_sector)
     reason = None
@@ -249,7 +257,7 @@ def _report(sector: Sector, match: Match | None, transported: Transported | None
         reason = (
             "nothing in the sector"
             if len(sector.hit_points) + len(sector.free_points) == 0
-            else "no atom is comparable"
+            else "no atom could be compared"
         )
     elif not transported.converged:
         reason = "the coupling did not converge"

@@ -5,14 +5,13 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from potserver.domain.dictionary import AtomDictionary
 from potserver.domain.types import Atom, Float32, Float64, Sector
-from potserver.numerics.coupling import Ragged, coupling_costs
+from potserver.numerics.coupling import CouplingCosts, Ragged, coupling_costs
 from potserver.numerics.geometry import rotation_z, thin
 from potserver.services.settings import MappingSettings, RankScore
-
-_RANK_VOXEL_M = 0.4
 
 
 class Match(NamedTuple):
@@ -20,13 +19,21 @@ class Match(NamedTuple):
 
     atom: Atom
     rotation_rad: float  # of the atom, about its centroid
-    w2_m2: float  # squared 2-Wasserstein distance, hits plus free points
-    converged: bool
+    w2_m2: float  # squared 2-Wasserstein distance under the entropic plan, hits plus free points
 
 
-def centre_of(hit_points: Float32, free_points: Float32) -> Float64:
-    """(3,) m: what a point set is centred on before it is compared: its hits, or its free points if it has none."""
-    return (hit_points if len(hit_points) else free_points).mean(axis=0, dtype=np.float64)
+def shared_centres(atom: Atom, sector: Sector) -> tuple[Float64, Float64]:
+    """(3,) and (3,) m: what an atom and a sector are centred on when they are compared, each in its own frame.
+
+    Their hits where both have some, else their free points: two clouds are only comparable about the same kind of centre.
+    """
+    if len(atom.hit_points) and len(sector.hit_points):
+        return _mean(atom.hit_points), _mean(sector.hit_points)
+    return _mean(atom.free_points), _mean(sector.free_points)
+
+
+def _mean(points: Float32) -> Float64:
+    return points.mean(axis=0, dtype=np.float64) if len(points) else np.zeros(3)
 
 
 class Matcher:
@@ -41,107 +48,107 @@ class Matcher:
         self._seed = seed
         rng = np.random.default_rng(seed)
         self._candidates: list[tuple[Atom, float]] = []
-        hits: list[Float32] = []
-        free: list[Float32] = []
-        self._hit_set: list[int] = []  # candidate -> set number, -1 for none
-        self._free_set: list[int] = []
+        hits, free, free_alone = _Side(), _Side(), _Side()
         for atom in dictionary:
-            centre = centre_of(atom.hit_points, atom.free_points)
-            h = self._subsample(atom.hit_points, settings.rank_hits, rng) - centre
-            f = self._subsample(atom.free_points, settings.rank_free, rng) - centre
+            h = self._subsample(atom.hit_points, settings.rank_hits, rng)
+            f = self._subsample(atom.free_points, settings.rank_free, rng)
+            centre = _mean(atom.hit_points if len(h) else atom.free_points)
             for angle in np.deg2rad(settings.rotations_deg):
                 rotation = rotation_z(float(angle))
                 self._candidates.append((atom, float(angle)))
-                self._hit_set.append(len(hits) if len(h) else -1)
-                self._free_set.append(len(free) if len(f) else -1)
-                if len(h):
-                    hits.append((h @ rotation.T).astype(np.float32))
-                if len(f):
-                    free.append((f @ rotation.T).astype(np.float32))
-        self._hits, self._free = Ragged.of(hits), Ragged.of(free)
+                hits.add((h - centre) @ rotation.T)
+                free.add((f - centre) @ rotation.T)
+                free_alone.add((f - _mean(atom.free_points)) @ rotation.T)
+        self._hits, self._free, self._free_alone = hits, free, free_alone
 
     def match(self, sectors: list[Sector]) -> list[Match | None]:
         """The best candidate for each sector; None where none is comparable (no atoms, or an empty sector)."""
         rng = np.random.default_rng(self._seed + 1)
-        target_hits: list[Float32] = []
-        target_free: list[Float32] = []
-        hit_pairs: list[tuple[int, int]] = []
-        free_pairs: list[tuple[int, int]] = []
-        n = len(self._candidates)
-        rows_hits = np.full((len(sectors), n), -1, np.int64)  # -> row of the solved batch
-        rows_free = np.full((len(sectors), n), -1, np.int64)
-        for s, sector in enumerate(sectors):
-            if len(sector.hit_points) + len(sector.free_points) == 0:
-                continue
-            centre = centre_of(sector.hit_points, sector.free_points)
-            for points, count, sets, pairs, rows, candidate_sets in (
-                (
-                    sector.hit_points,
-                    self._settings.rank_hits,
-                    target_hits,
-                    hit_pairs,
-                    rows_hits,
-                    self._hit_set,
-                ),
-                (
-                    sector.free_points,
-                    self._settings.rank_free,
-                    target_free,
-                    free_pairs,
-                    rows_free,
-                    self._free_set,
-                ),
-            ):
-                if len(points) == 0:
-                    continue
-                sets.append((self._subsample(points, count, rng) - centre).astype(np.float32))
-                for c, number in enumerate(candidate_sets):
-                    if number >= 0:
-                        rows[s, c] = len(pairs)
-                        pairs.append((number, len(sets) - 1))
-        hits = self._solve(self._hits, target_hits, hit_pairs)
-        free = self._solve(self._free, target_free, free_pairs)
+        hits, free, alone = (
+            _Batch(side, len(sectors)) for side in (self._hits, self._free, self._free_alone)
+        )
+        for number, sector in enumerate(sectors):
+            f = self._subsample(sector.free_points, self._settings.rank_free, rng)
+            if len(sector.hit_points):
+                centre = _mean(sector.hit_points)
+                hits.add(number, self._subsample(sector.hit_points, self._settings.rank_hits, rng) - centre)
+                free.add(number, f - centre)
+            else:
+                alone.add(number, f - _mean(sector.free_points))
+        solved = [(batch, self._solve(batch)) for batch in (hits, free, alone)]
         return [
-            self._best(sector, rows_hits[s], rows_free[s], hits, free) for s, sector in enumerate(sectors)
+            self._best([batch.of(number, costs) for batch, costs in solved]) for number in range(len(sectors))
         ]
 
     def _subsample(self, points: Float32, n: int, rng: np.random.Generator) -> Float32:
-        return points[thin(points, n, _RANK_VOXEL_M, rng)]
+        return points[thin(points, n, self._settings.rank_voxel_m, rng)]
 
-    def _solve(
-        self, sources: Ragged, targets: list[Float32], pairs: list[tuple[int, int]]
-    ) -> tuple[Float64, np.ndarray]:
+    def _solve(self, batch: _Batch) -> CouplingCosts:
         s = self._settings
-        solved = coupling_costs(
-            sources, Ragged.of(targets), np.asarray(pairs, np.int64).reshape(-1, 2), reg=s.rank_reg_m2,
-            tolerance=s.rank_tolerance, max_iterations=s.rank_iterations, threads=self._threads,
+        return coupling_costs(
+            Ragged.of(batch.side.sets), Ragged.of(batch.targets), np.asarray(batch.pairs, np.int64).reshape(-1, 2),
+            reg=s.rank_reg_m2, tolerance=s.rank_tolerance, max_iterations=s.rank_iterations, threads=self._threads,
         )  # fmt: skip
-        return solved.cost.astype(np.float64), solved.converged
 
-    def _best(self, sector: Sector, rows_hits, rows_free, hits, free) -> Match | None:
-        score = np.zeros(len(self._candidates))
-        w2 = np.zeros(len(self._candidates))
-        converged = np.ones(len(self._candidates), bool)
-        compared = False
-        for points, rows, (cost, ok) in (
-            (sector.hit_points, rows_hits, hits),
-            (sector.free_points, rows_free, free),
-        ):
-            if len(points) == 0:
-                continue  # rank by the other label alone
-            known = rows >= 0
-            value = np.where(known, cost[np.maximum(rows, 0)] if len(cost) else np.inf, np.inf)
-            solved = np.where(known, ok[np.maximum(rows, 0)] if len(ok) else False, False)
-            value = np.where(solved, value, np.inf)  # a solve that failed cannot win
-            compared |= bool(np.isfinite(value).any())
-            w2 += value
-            if self._settings.rank_score is RankScore.NORMALISED:
-                finite = value[np.isfinite(value)]
-                value = value / max(float(finite.max(initial=0.0)), 1e-12)
-            score += value
-            converged &= solved
-        if not compared or not np.isfinite(score).any():
+    def _best(self, costs_by_label: list[Float64 | None]) -> Match | None:
+        """Eq. 7 over all candidates; each label's costs are (C,) m^2, infinite where a solve failed or there is no set."""
+        compared = [costs for costs in costs_by_label if costs is not None]
+        if not compared or not self._candidates:
             return None
+        w2 = np.sum(compared, axis=0)
+        score = w2
+        if self._settings.rank_score is RankScore.NORMALISED:
+            score = np.sum(
+                [c / max(float(c[np.isfinite(c)].max(initial=0.0)), 1e-12) for c in compared], axis=0
+            )
         best = int(np.argmin(score))
+        if not np.isfinite(score[best]):
+            return None
         atom, angle = self._candidates[best]
-        return Match(atom, angle, float(w2[best]), bool(converged[best]))
+        return Match(atom, angle, float(w2[best]))
+
+
+class _Side:
+    """One label's point sets of all candidates; a candidate may have none."""
+
+    def __init__(self) -> None:
+        self.sets: list[Float32] = []
+        self.set_of: list[int | None] = []  # candidate -> set
+
+    def add(self, points: Float64) -> None:
+        self.set_of.append(len(self.sets) if len(points) else None)
+        if len(points):
+            self.sets.append(points.astype(np.float32))
+
+
+class _Batch:
+    """All problems of one label: the sectors that have it against every candidate that has it."""
+
+    def __init__(self, side: _Side, n_sectors: int) -> None:
+        self.side = side
+        self.targets: list[Float32] = []
+        self.pairs: list[tuple[int, int]] = []
+        self._row: NDArray[np.int64] = np.full((n_sectors, len(side.set_of)), -1, np.int64)
+        self._has: NDArray[np.bool_] = np.zeros(n_sectors, bool)
+
+    def add(self, sector: int, points: Float64) -> None:
+        """Pose the problems of one sector; none if it has no points of this label."""
+        if len(points) == 0:
+            return
+        self._has[sector] = True
+        for candidate, number in enumerate(self.side.set_of):
+            if number is not None:
+                self._row[sector, candidate] = len(self.pairs)
+                self.pairs.append((number, len(self.targets)))
+        self.targets.append(points.astype(np.float32))
+
+    def of(self, sector: int, solved: CouplingCosts) -> Float64 | None:
+        """(C,) m^2: cost of each candidate; None if the sector has no points of this label."""
+        if not self._has[sector]:
+            return None
+        costs = np.full(len(self.side.set_of), np.inf)
+        row = self._row[sector]
+        known = row >= 0
+        # a solve that failed cannot win
+        costs[known] = np.where(solved.converged[row[known]], solved.cost[row[known]], np.inf)
+        return costs

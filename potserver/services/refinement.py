@@ -5,15 +5,19 @@ All weights are solved jointly, the prior stays fixed and every datum counts onc
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from potserver.domain.types import Float64, KernelSet
+from potserver.errors import SolverError
 from potserver.numerics.beams import LabelledPoints
 from potserver.numerics.geometry import voxel_pick
 from potserver.numerics.kernel_index import build_index, latent_sums, sparse_features
 from potserver.numerics.logistic import fit_sparse
 from potserver.services.settings import MappingSettings
 
+_TOO_WIDE = 1.5  # times the coarse spacing
 _GAMMA_SHAPE = 100.0  # a placed kernel's width is known to 10 %
 
 
@@ -50,11 +54,13 @@ def fill_kernels(
 ) -> KernelSet:
     """Kernels for the points that `known` does not explain: coarse ones anywhere, fine ones at hits.
 
-    A point is explained when the kernels of the right scale sum to at least `explained_activation` there.
+    A point is explained when the kernels of the right scale sum to at least `explained_activation` there. Kernels much wider
+    than the coarse ones explain nothing: an atom of a wide street must not keep detail out of a room.
     """
     parts: list[KernelSet] = []
     if settings.fill_coarse_m:
-        wide = known.take(~is_fine(known, settings))
+        too_wide = known.gamma < gamma_of_spacing(_TOO_WIDE * settings.fill_coarse_m)
+        wide = known.take(~is_fine(known, settings) & ~too_wide)
         parts.append(_fill(labelled.points, wide, settings.fill_coarse_m, settings, threads))
     if settings.fill_fine_m:
         narrow = known.take(is_fine(known, settings))
@@ -89,9 +95,16 @@ def activation(kernels: KernelSet, points: Float64, *, threads: int) -> np.ndarr
     return latent_sums(index, points, threads=threads).activation
 
 
+class Refined(NamedTuple):
+    """Kernels with refined weights, and whether the solve reached its tolerance; if not, they are the best found."""
+
+    kernels: KernelSet
+    converged: bool
+
+
 def refine(
     kernels: KernelSet, labelled: LabelledPoints, *, feature_cut: float, tolerance: float, threads: int
-) -> KernelSet:
+) -> Refined:
     """Solve all weights of `kernels` jointly on labelled points; their present mean and variance are the prior.
 
     Args:
@@ -100,6 +113,8 @@ def refine(
         feature_cut: Activations below this are left out of the solve.
         tolerance: Of the gradient, relative to its start.
         threads: Threads of the solve.
+    Raises:
+        SolverError: the solve ended without numbers.
     """
     features = sparse_features(
         labelled.points,
@@ -112,4 +127,8 @@ def refine(
         features, labelled.occupied, kernels.weight_mean, kernels.weight_var,
         tolerance=tolerance, threads=threads,
     )  # fmt: skip
-    return kernels.replace(weight_mean=posterior.mean, weight_var=posterior.var)
+    if not (np.isfinite(posterior.mean).all() and np.isfinite(posterior.var).all()):
+        raise SolverError(
+            f"the weights of {len(kernels)} kernels on {len(labelled.points)} points came out NaN or infinite"
+        )
+    return Refined(kernels.replace(weight_mean=posterior.mean, weight_var=posterior.var), posterior.converged)

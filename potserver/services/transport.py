@@ -10,10 +10,9 @@ from potserver.domain.types import Float32, KernelSet, Sector
 from potserver.numerics.coupling import Coupling, couple
 from potserver.numerics.displacement import carry
 from potserver.numerics.geometry import in_sector, rotated_diagonal, rotation_z, thin
-from potserver.services.matching import Match, centre_of
+from potserver.services.matching import Match, shared_centres
 from potserver.services.settings import MappingSettings
 
-_COUPLE_VOXEL_M = 0.25
 _RETRY_REG_FACTOR = 4.0  # an unconverged coupling is solved once more, blurrier
 
 
@@ -34,8 +33,7 @@ def transport(match: Match, sector: Sector, settings: MappingSettings, seed: int
     """
     rng = np.random.default_rng(seed)
     atom, rotation = match.atom, rotation_z(match.rotation_rad)
-    source_centre = centre_of(atom.hit_points, atom.free_points)
-    target_centre = centre_of(sector.hit_points, sector.free_points)
+    source_centre, target_centre = shared_centres(atom, sector)
     hinge = (atom.kernels.hinge_mean - source_centre) @ rotation.T
     solved: list[Coupling] = []
 
@@ -49,22 +47,25 @@ def transport(match: Match, sector: Sector, settings: MappingSettings, seed: int
 
     hits = bool(len(atom.hit_points) and len(sector.hit_points))
     free = bool(len(atom.free_points) and len(sector.free_points))
-    everything = np.ones(len(hinge), bool)
-    if settings.label_aware and hits and free:
-        occupied = atom.kernels.weight_mean > 0
-        move(occupied, atom.hit_points, sector.hit_points)
+    occupied = atom.kernels.weight_mean > 0
+    carried = np.ones(len(hinge), bool)
+    if settings.label_aware and free:
         move(~occupied, atom.free_points, sector.free_points)
+        if hits:
+            move(occupied, atom.hit_points, sector.hit_points)
+        else:
+            carried = ~occupied  # nothing was hit here: obstacles of the atom have no place to go
     elif hits:
-        move(everything, atom.hit_points, sector.hit_points)
+        move(carried, atom.hit_points, sector.hit_points)
     elif free:
-        move(everything, atom.free_points, sector.free_points)
+        move(carried, atom.free_points, sector.free_points)
     converged = bool(solved) and all(c.converged for c in solved)
     error = max((c.marginal_error for c in solved), default=float("nan"))
     iterations = sum(c.n_iterations for c in solved)
     if not converged:
         return Transported(KernelSet.empty(), False, error, iterations)
     hinge += target_centre
-    keep = in_sector(hinge, *_keep_bounds(sector, settings))
+    keep = carried & in_sector(hinge, *_keep_bounds(sector, settings))
     R, t = sector.T_map_sector[:3, :3], sector.T_map_sector[:3, 3]
     kernels = atom.kernels.take(keep)
     return Transported(
@@ -85,7 +86,7 @@ def _keep_bounds(sector: Sector, settings: MappingSettings) -> tuple[float, floa
 
 
 def _subsample(points: Float32, settings: MappingSettings, rng: np.random.Generator) -> Float32:
-    return points[thin(points, settings.couple_points, _COUPLE_VOXEL_M, rng)]
+    return points[thin(points, settings.couple_points, settings.couple_voxel_m, rng)]
 
 
 def _couple(x: Float32, y: Float32, settings: MappingSettings) -> Coupling:

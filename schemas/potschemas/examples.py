@@ -85,6 +85,7 @@ def examples() -> dict[str, m.Message]:
             n_points=3,
             n_kernels=2,
             n_kernels_added=1,
+            n_kernels_transported=1,
             map_kernels=5120,
             sectors=[served, left_out],
             kernels=kernels,

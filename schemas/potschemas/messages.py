@@ -162,6 +162,7 @@ class Receipt(Message, frozen=True, kw_only=True):
     n_points: Count = 0  # beams used
     n_kernels: Count = 0  # kernels of the instantaneous map
     n_kernels_added: Count = 0  # kernels that the overall map took
+    n_kernels_transported: Count = 0  # of those, carried from atoms; the others were placed on the data
     map_kernels: Count = 0  # kernels in the overall map now
     sectors: list[SectorReport] = []  # how each sector was served
     kernels: Kernels | None = None  # the instantaneous map; in `q/integrate` replies only

@@ -86,9 +86,9 @@ class Ranking(NamedTuple):
 def rank(atoms: list[Atom], rotations_rad: list[float], sector: Sector, reg: float) -> Ranking:
     """Brute force over every atom in every rotation."""
 
-    def centre(thing: Atom | Sector) -> Float64:
-        points = thing.hit_points if len(thing.hit_points) else thing.free_points
-        return points.astype(np.float64).mean(axis=0)
+    def centre(thing: Atom | Sector, other: Atom | Sector) -> Float64:
+        both = len(thing.hit_points) and len(other.hit_points)
+        return (thing.hit_points if both else thing.free_points).astype(np.float64).mean(axis=0)
 
     costs = np.zeros((2, len(atoms), len(rotations_rad)))
     for label, name in enumerate(("hit_points", "free_points")):
@@ -100,8 +100,8 @@ def rank(atoms: list[Atom], rotations_rad: list[float], sector: Sector, reg: flo
                 if len(getattr(atom, name)) == 0:
                     costs[label, a, r] = np.inf
                     continue
-                source = rotated(getattr(atom, name) - centre(atom), angle)
-                costs[label, a, r] = sinkhorn_cost(source, target - centre(sector), reg)
+                source = rotated(getattr(atom, name) - centre(atom, sector), angle)
+                costs[label, a, r] = sinkhorn_cost(source, target - centre(sector, atom), reg)
     largest = [c[np.isfinite(c)].max(initial=0.0) or 1.0 for c in costs]
     return Ranking(costs.sum(axis=0), costs[0] / largest[0] + costs[1] / largest[1])
 

@@ -97,7 +97,7 @@ def _ring_atom():
 def test_row_a14_the_paper_crops_to_a_full_circle_about_the_sensor() -> None:
     atom = _ring_atom()
     sector = reference.sector(atom.hit_points, atom.free_points)
-    carried = transport(Match(atom, 0.0, 0.0, True), sector, PAPER, seed=0)
+    carried = transport(Match(atom, 0.0, 0.0), sector, PAPER, seed=0)
     assert carried.converged
     radius = np.hypot(carried.kernels.hinge_mean[:, 0], carried.kernels.hinge_mean[:, 1])
     bearing = np.arctan2(carried.kernels.hinge_mean[:, 1], carried.kernels.hinge_mean[:, 0])
@@ -110,7 +110,7 @@ def test_the_default_profile_crops_to_the_sector() -> None:
     atom = _ring_atom()
     settings = dataclasses.replace(MappingSettings(), max_range_m=20.0, keep_in_sector=True)
     sector = reference.sector(atom.hit_points, atom.free_points)
-    carried = transport(Match(atom, 0.0, 0.0, True), sector, settings, seed=0)
+    carried = transport(Match(atom, 0.0, 0.0), sector, settings, seed=0)
     bearing = np.arctan2(carried.kernels.hinge_mean[:, 1], carried.kernels.hinge_mean[:, 0])
     assert 9 <= len(carried.kernels) <= 18
     assert np.abs(bearing).max() <= math.radians(36.0)

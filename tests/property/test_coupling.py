@@ -81,7 +81,7 @@ def test_a_ragged_batch_is_its_problems_one_by_one_on_any_number_of_threads(
     seed: int, sizes: list[int], reg: float
 ) -> None:
     sources = [_pair(seed + i, n, 1)[0] for i, n in enumerate(sizes)]
-    targets = [_pair(seed - i, 1, n)[1] for i, n in enumerate(reversed(sizes))]
+    targets = [_pair(seed + 1000 + i, 1, n)[1] for i, n in enumerate(reversed(sizes))]
     pairs = np.stack(np.meshgrid(np.arange(len(sizes)), np.arange(len(sizes))), axis=-1).reshape(-1, 2)
     batch, threaded = (
         coupling_costs(Ragged.of(sources), Ragged.of(targets), pairs, reg=reg, threads=threads)

@@ -322,6 +322,9 @@ def test_a_sector_without_an_atom_still_travels() -> None:
         sectors=[sector],
         n_points=5,
         n_kernels_added=4,
+        n_kernels_transported=3,
+        converged=True,
+        rule=RULE,
         map_kernels=4,
         changed=TileChange(10.0, [(np.int64(-1), np.int64(2), np.int64(0))]),  # type: ignore[list-item]
         timings_ms={},

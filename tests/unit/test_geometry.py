@@ -8,7 +8,6 @@ import math
 import numpy as np
 import pytest
 
-from potserver.domain.types import yaw_pose
 from potserver.numerics.geometry import (
     in_sector,
     rotated_diagonal,
@@ -16,8 +15,6 @@ from potserver.numerics.geometry import (
     sector_edges,
     thin,
     voxel_pick,
-    wrap_angle,
-    yaw_of,
 )
 
 
@@ -78,19 +75,6 @@ def test_rotated_diagonal_is_the_diagonal_of_the_turned_covariance() -> None:
     np.testing.assert_allclose(rotated_diagonal(variance, rotation), truth)
     np.testing.assert_allclose(rotated_diagonal(variance, rotation).sum(axis=1), variance.sum(axis=1))
     assert rotated_diagonal(variance.astype(np.float32), rotation).dtype == np.float32
-
-
-@pytest.mark.parametrize("yaw", [-3.0, -0.5, 0.0, 1.0, 3.1])
-def test_yaw_comes_back(yaw: float) -> None:
-    assert yaw_of(yaw_pose(4.0, 5.0, yaw)) == pytest.approx(yaw)
-
-
-def test_wrapped_angles_are_the_same_angles() -> None:
-    angle = np.linspace(-20.0, 20.0, 1001)
-    wrapped = wrap_angle(angle)
-    np.testing.assert_allclose(np.exp(1j * wrapped), np.exp(1j * angle), atol=1e-12)
-    assert (wrapped >= -np.pi).all()
-    assert (wrapped < np.pi).all()
 
 
 @pytest.mark.parametrize("offset", [0.0, -1234.5, 5e6])

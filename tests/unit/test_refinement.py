@@ -9,7 +9,9 @@ import pytest
 
 from potserver.domain.kernel_map import KernelMap
 from potserver.domain.types import KernelSet
+from potserver.errors import SolverError
 from potserver.numerics.beams import LabelledPoints
+from potserver.numerics.logistic import WeightPosterior
 from potserver.services.refinement import (
     activation,
     fill_kernels,
@@ -33,7 +35,7 @@ def _labelled(n: int = 600, seed: int = 0, planar: bool = False) -> LabelledPoin
 
 
 def _refine(kernels: KernelSet, labelled: LabelledPoints, tolerance: float = 1e-4) -> KernelSet:
-    return refine(kernels, labelled, feature_cut=0.01, tolerance=tolerance, threads=1)
+    return refine(kernels, labelled, feature_cut=0.01, tolerance=tolerance, threads=1).kernels
 
 
 @pytest.mark.parametrize("offset", [0.0, -7.3, 4e6])
@@ -134,3 +136,29 @@ def test_a_surer_prior_moves_less() -> None:
 
 def test_nothing_to_refine() -> None:
     assert len(_refine(KernelSet.empty(), _labelled())) == 0
+
+
+def test_weights_that_are_not_numbers_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    labelled = _labelled()
+    placed = fill_kernels(labelled, KernelSet.empty(), SETTINGS, threads=1)
+    nan = np.full(len(placed), np.nan, np.float32)
+    bad = WeightPosterior(nan, nan, 1, 1, 1.0, False)
+    monkeypatch.setattr("potserver.services.refinement.fit_sparse", lambda *_, **__: bad)
+    with pytest.raises(SolverError, match="NaN"):
+        refine(placed, labelled, feature_cut=0.01, tolerance=0.1, threads=1)
+
+
+def test_the_weights_do_not_depend_on_the_number_of_threads() -> None:
+    labelled = _labelled()
+    placed = fill_kernels(labelled, KernelSet.empty(), SETTINGS, threads=1)
+    one, three = (
+        refine(placed, labelled, feature_cut=0.01, tolerance=0.03, threads=n).kernels for n in (1, 3)
+    )
+    np.testing.assert_array_equal(one.weight_mean, three.weight_mean)
+
+
+def test_kernels_much_wider_than_the_coarse_ones_explain_nothing() -> None:
+    labelled = _labelled()
+    wide = place_kernels(labelled.points, 8.0, 50.0)
+    without = fill_kernels(labelled, KernelSet.empty(), SETTINGS, threads=1)
+    assert len(fill_kernels(labelled, wide, SETTINGS, threads=1)) == len(without)
