@@ -29,7 +29,7 @@ from potserver.numerics.geometry import in_sector, rotation_z, sector_edges, vox
 from potserver.numerics.kernel_index import sparse_features
 from potserver.numerics.threads import default_threads, parallel_map
 from potserver.services.matching import Match, Matcher
-from potserver.services.refinement import Refined, activation, fill_kernels, is_fine, refine
+from potserver.services.refinement import Refined, activation, fill_kernels, is_fine, is_too_wide, refine
 from potserver.services.settings import MappingSettings
 from potserver.services.transport import Transported, transport
 
@@ -197,7 +197,9 @@ class MappingService:
         lower, upper = labelled.points.min(axis=0) - 3.0, labelled.points.max(axis=0) + 3.0
         near = ((present.hinge_mean >= lower) & (present.hinge_mean <= upper)).all(axis=1)
         local = present.take(near)
-        # a transported kernel is taken where the scan has data for it and the map has no kernel yet
+        # a transported kernel is taken where the scan has data for it and the map has no kernel yet; one much wider than the
+        # map's own would only make the solve harder
+        carried = carried.take(~is_too_wide(carried, s))
         if len(carried):
             supported = self._support(carried, labelled, rng) >= 1.0
             carried = carried.take(supported)

@@ -59,8 +59,7 @@ def fill_kernels(
     """
     parts: list[KernelSet] = []
     if settings.fill_coarse_m:
-        too_wide = known.gamma < gamma_of_spacing(_TOO_WIDE * settings.fill_coarse_m)
-        wide = known.take(~is_fine(known, settings) & ~too_wide)
+        wide = known.take(~is_fine(known, settings) & ~is_too_wide(known, settings))
         parts.append(_fill(labelled.points, wide, settings.fill_coarse_m, settings, threads))
     if settings.fill_fine_m:
         narrow = known.take(is_fine(known, settings))
@@ -68,6 +67,13 @@ def fill_kernels(
             _fill(labelled.points[labelled.occupied], narrow, settings.fill_fine_m, settings, threads)
         )
     return KernelSet.concatenate(parts)
+
+
+def is_too_wide(kernels: KernelSet, settings: MappingSettings) -> np.ndarray:
+    """(K,) which kernels are much wider than those that the map places itself; none, if it places none."""
+    if not settings.fill_coarse_m:
+        return np.zeros(len(kernels), bool)
+    return kernels.gamma < gamma_of_spacing(_TOO_WIDE * settings.fill_coarse_m)
 
 
 def is_fine(kernels: KernelSet, settings: MappingSettings) -> np.ndarray:
