@@ -36,13 +36,14 @@ Serve maps to robots and planners over Eclipse Zenoh.
 
 The server listens on tcp/127.0.0.1:7447 only. It needs no router: robots connect to it in client mode.
 It is ready when it logs server_started, and when its liveliness token is up.
+Anyone who reaches the port may write: use Zenoh's access control and TLS.
 SIGTERM or Ctrl-C drains it: waiting clouds are mapped, everybody gets an answer, exit code 0. A second one
 ends it at once."""
 
 _SERVE_EXAMPLES = """\
 examples:
   potserver serve                                        one map, `default`, for this machine only
-  potserver serve --listen tcp/0.0.0.0:7447              for the network: read the security notes first
+  potserver serve --listen tcp/0.0.0.0:7447              for the network: who reaches the port may write
   potserver serve --map ground --map first_floor         two maps, each with its own writer
   potserver serve --listen tcp/127.0.0.1:0               any free port; the log says which
   potserver serve --connect tcp/router:7447 --listen tcp/127.0.0.1:7448

@@ -11,6 +11,8 @@ publisher and its queryable.
 from __future__ import annotations
 
 import atexit
+import collections
+import contextlib
 import dataclasses
 import threading
 import time
@@ -252,7 +254,7 @@ class _MapNode:
         self.map_id, self.mapper = map_id, mapper
         self._session = session
         self._keys = keys.MapKeys(s.root, map_id)
-        self._tokens: list[ServerToken] = []
+        self._tokens: collections.deque[ServerToken] = collections.deque()
         allowed = frozenset(s.intake.robots)
         self.intake = IntakeQueue(
             max_queued=s.intake.max_queued,
@@ -269,6 +271,7 @@ class _MapNode:
             mapper=mapper,
             intake=self.intake,
             health=health,
+            limits=s.limits,
             prompt=self.prompt,
             bulk=self.bulk,
         )
@@ -342,6 +345,7 @@ class _MapNode:
                 mapper=mapper,
                 intake=self.intake,
                 clear=self._writer.clear,
+                withdraw=self.withdraw,
                 prompt=self.prompt,
                 health=health,
                 limits=s.limits,
@@ -354,10 +358,11 @@ class _MapNode:
         self._tokens.append(ServerToken(self._session, self._keys, server_id))
 
     def withdraw(self) -> None:
-        """Say that it is not, and take no more clouds."""
-        while self._tokens:
-            self._tokens.pop().undeclare()
+        """Say that it is not, and take no more clouds; from any thread, any number of times."""
         self.intake.stop_admitting()
+        with contextlib.suppress(IndexError):
+            while True:
+                self._tokens.pop().undeclare()
 
     def drain(self, deadline: float) -> bool:
         """Map the clouds that wait; refuse those left at the deadline. False if any were left."""

@@ -172,6 +172,8 @@ def _publish(arguments: argparse.Namespace) -> int:
     _write_json(arguments.json, report.to_json())
     if arguments.json != "-":
         _say_play(report)
+    if report.failure is not None:
+        raise report.failure
     return EXIT_OK if report.all_accepted else EXIT_FAILED
 
 
@@ -529,6 +531,8 @@ def _load(arguments: argparse.Namespace) -> int:
     _write_json(arguments.json, report.to_json())
     if arguments.json != "-":
         _say_load(report)
+    if report.interrupted:
+        return _complain("interrupted", EXIT_INTERRUPTED)
     return EXIT_OK if report.nothing_lost else EXIT_FAILED
 
 
@@ -651,7 +655,7 @@ def _add_control(commands: Any) -> None:
         commands,
         "control",
         _control,
-        help="carry out a control verb: clear, drain, save, load",
+        help="carry out a control verb: clear, drain",
         description="Carry out a control verb on the map; the server says which it has.",
         epilog="examples:\n  potclient control clear",
     )

@@ -66,6 +66,12 @@ _SPLIT_ABOVE = 20_000  # up to here one query is sent without asking for the ser
 _CHUNKS_IN_FLIGHT = 4
 _CHUNK_RETRIES = 8
 _DIAGNOSIS_TIMEOUT_S = 0.5
+# megabytes, that must not delay short questions and answers on the same link
+_BULK_LANES = {
+    "integrate": zenoh.Priority.DATA_LOW,
+    "grid": zenoh.Priority.DATA,
+    "params": zenoh.Priority.DATA,
+}
 
 _open_clients: weakref.WeakSet[MapClient] = weakref.WeakSet()
 
@@ -79,8 +85,14 @@ def _close_all() -> None:
 class Subscription:
     """Samples of one key, delivered on a thread of its own until closed. Also a context manager."""
 
-    def __init__(self, subscriber: Any, deliver: Callable[[zenoh.Sample], None], name: str) -> None:
-        self._subscriber, self._deliver = subscriber, deliver
+    def __init__(
+        self,
+        subscriber: Any,
+        deliver: Callable[[zenoh.Sample], None],
+        name: str,
+        on_close: Callable[[Subscription], None] = lambda _: None,
+    ) -> None:
+        self._subscriber, self._deliver, self._on_close = subscriber, deliver, on_close
         self._thread = threading.Thread(target=self._run, name=f"potclient-{name}", daemon=True)
         self._thread.start()
 
@@ -88,13 +100,16 @@ class Subscription:
         for sample in self._subscriber:  # ends when it is undeclared or the session closes
             try:
                 self._deliver(sample)
-            except Exception:  # one bad message, or the user's callback: the stream goes on
+            except BadReplyError as error:  # somebody else's message, or another version's
+                log.warning("%s: %s", sample.key_expr, error)
+            except Exception:  # the user's callback: the stream goes on
                 log.exception("callback for %s failed", sample.key_expr)
 
     def close(self) -> None:
         """Stop; the callback may still be running once more when this returns."""
         with contextlib.suppress(zenoh.ZError):
             self._subscriber.undeclare()
+        self._on_close(self)
 
     def __enter__(self) -> Subscription:
         return self
@@ -207,7 +222,7 @@ class MapClient:
     def _teardown(self) -> None:
         for feed in list(self._feeds.values()):
             feed.close()
-        for subscription in self._subscriptions:
+        for subscription in list(self._subscriptions):
             subscription.close()
         declared: list[Any] = [
             *self._tokens.values(),
@@ -256,7 +271,7 @@ class MapClient:
             NoServerError: nobody does within `timeout_s` (default: the client's).
         """
         timeout_s = self._timeout_s if timeout_s is None else timeout_s
-        querier = self._querier(self.keys.query(op), bulk=op == "integrate")
+        querier = self._querier(self.keys.query(op))
         until = time.monotonic() + timeout_s
         while not _is_matching(querier):
             if time.monotonic() >= until:
@@ -428,7 +443,14 @@ class MapClient:
             self._feeds[robot] = feed
 
             def settle(sample: zenoh.Sample) -> None:
-                receipt = feed.settle(_decode(sample.payload, messages.Receipt))
+                message = _decode(sample.payload, messages.Receipt)
+                receipt = feed.settle(message)
+                if receipt is None and feed.stray_receipts == 1:  # once
+                    log.warning(
+                        "a receipt for cloud %d of %s, which this client did not send: another process uses the robot's id",
+                        message.seq,
+                        robot,
+                    )
                 if receipt is not None and self.on_receipt is not None:
                     self.on_receipt(receipt)
 
@@ -639,7 +661,7 @@ class MapClient:
         return _decode(sample.payload, messages.Stats)
 
     def control(self, verb: str, *, timeout_s: float | None = None) -> messages.ControlReply:
-        """Carry out a control verb: clear, drain, save, load.
+        """Carry out a control verb: clear, drain.
 
         Raises:
             UnsupportedError: the server has no such verb.
@@ -686,7 +708,11 @@ class MapClient:
             )
 
         subscriber = self._session.declare_subscriber(self.keys.params(robot), zenoh.handlers.RingChannel(16))
-        return Subscription(subscriber, deliver, f"params-{robot}")
+        return Subscription(subscriber, deliver, f"params-{robot}", self._forget)
+
+    def _forget(self, subscription: Subscription) -> None:
+        with self._lock, contextlib.suppress(ValueError):  # closed twice
+            self._subscriptions.remove(subscription)
 
     def _watch(
         self, key: str, kind: type[MessageT], callback: Callable[[MessageT], None], name: str
@@ -697,6 +723,7 @@ class MapClient:
                 self._session.declare_subscriber(key, zenoh.handlers.RingChannel(64)),
                 lambda sample: callback(_decode(sample.payload, kind)),
                 name,
+                self._forget,
             )
             self._subscriptions.append(subscription)
             return subscription
@@ -708,18 +735,16 @@ class MapClient:
         return _decode(next(self._ask(op, request, timeout_s)).payload, kind)
 
     def _ask(self, op: str, request: Message, timeout_s: float) -> Iterator[zenoh.Sample]:
-        return self._ask_key(self.keys.query(op), request, timeout_s, bulk=op == "integrate")
+        return self._ask_key(self.keys.query(op), request, timeout_s)
 
-    def _ask_key(
-        self, key: str, request: Message, timeout_s: float, *, bulk: bool = False
-    ) -> Iterator[zenoh.Sample]:
+    def _ask_key(self, key: str, request: Message, timeout_s: float) -> Iterator[zenoh.Sample]:
         """Send a question now; the iterator gives the replies as they come and raises for everything that is not one."""
         if not (math.isfinite(timeout_s) and timeout_s > 0):
             raise UsageError(f"timeout_s {timeout_s}: need a positive number of seconds")
         payload = encode(request)
         encoding = encoding_of(request)
         if timeout_s == self._timeout_s:
-            handler = self._zenoh_call(self._querier(key, bulk).get, payload=payload, encoding=encoding)
+            handler = self._zenoh_call(self._querier(key).get, payload=payload, encoding=encoding)
         else:  # the time-out of a declared querier is fixed
             handler = self._zenoh_call(
                 self._session.get,
@@ -727,7 +752,7 @@ class MapClient:
                 payload=payload,
                 encoding=encoding,
                 timeout=timeout_s,
-                **_query_qos(bulk),
+                **_query_qos(key),
             )
         return self._replies(handler, key, len(payload), timeout_s)
 
@@ -758,7 +783,7 @@ class MapClient:
             return NoServerError(
                 f"{key}: the connection to {self._where} is lost; Zenoh reconnects by itself, try again"
             )
-        querier = self._querier(key, bulk=key == self.keys.query("integrate"))
+        querier = self._querier(key)
         with (
             self._servers_changed
         ):  # the tokens of a session that was opened just now may still be on their way
@@ -786,12 +811,12 @@ class MapClient:
             maps = sorted({map_id for _, map_id in self._alive} - {self.keys.map_id})
         return f"; maps served here: {', '.join(maps)}" if maps else "; start one with `potserver serve`"
 
-    def _querier(self, key: str, bulk: bool) -> zenoh.Querier:
+    def _querier(self, key: str) -> zenoh.Querier:
         with self._lock:
             self._check_open()
             querier = self._queriers.get(key)
             if querier is None:
-                querier = self._session.declare_querier(key, timeout=self._timeout_s, **_query_qos(bulk))
+                querier = self._session.declare_querier(key, timeout=self._timeout_s, **_query_qos(key))
                 self._queriers[key] = querier
             return querier
 
@@ -875,13 +900,14 @@ def _check_parts(what: str, parts: dict[int, Any], totals: set[int], revisions: 
         raise IncompleteReplyError(f"{what}: {len(parts)} of {max(totals)} parts came")
 
 
-def _query_qos(bulk: bool) -> dict[str, Any]:
+def _query_qos(key: str) -> dict[str, Any]:
     """The lane of a question; its replies take the same one. No consolidation: parts of one reply share a key."""
+    priority = _BULK_LANES.get(key.rsplit("/", 1)[-1], zenoh.Priority.INTERACTIVE_HIGH)
     return {
         "consolidation": zenoh.ConsolidationMode.NONE,
         "congestion_control": zenoh.CongestionControl.BLOCK,
-        "priority": zenoh.Priority.DATA_LOW if bulk else zenoh.Priority.INTERACTIVE_HIGH,
-        "express": not bulk,
+        "priority": priority,
+        "express": priority == zenoh.Priority.INTERACTIVE_HIGH,
     }
 
 

@@ -81,6 +81,7 @@ class LoadReport:
     queries: Percentiles
     examples: dict[str, str]  # one message a kind of failure
     server_stats: dict[str, Any] | None = None
+    interrupted: bool = False  # by ^C
 
     @property
     def nothing_lost(self) -> bool:
@@ -182,10 +183,12 @@ def run_load(
         ]
         for thread in threads:
             thread.start()
+        interrupted = False
         try:
             for thread in threads:
                 thread.join()
         except KeyboardInterrupt:  # what was sent so far still gets its place
+            interrupted = True
             stop.set()
             for thread in threads:
                 thread.join()
@@ -210,6 +213,7 @@ def run_load(
             queries=Percentiles.of(tally.query_s),
             examples=tally.examples,
             server_stats=stats,
+            interrupted=interrupted,
         )
 
 

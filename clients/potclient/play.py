@@ -12,7 +12,7 @@ import numpy as np
 
 from potclient.client import MapClient
 from potclient.datasets.scans import RecordedScan, Recording
-from potclient.errors import MapServerError
+from potclient.errors import MapServerError, PotclientError
 from potclient.holdout import HoldOut, LabelledPoints
 from potclient.metrics import Metrics, score
 from potclient.results import Receipt
@@ -47,11 +47,12 @@ class PlayReport:
     elapsed_s: float
     held_out: Metrics | None = None
     n_held_out: int = 0  # labelled points; the score may be of a fixed-seed sample of them
+    failure: PotclientError | KeyboardInterrupt | None = None  # what ended it before the last scan
 
     @property
     def all_accepted(self) -> bool:
         """Every scan has a receipt that says accepted."""
-        return all(scan.status == "accepted" for scan in self.scans)
+        return self.failure is None and all(scan.status == "accepted" for scan in self.scans)
 
     def count(self, status: str) -> int:
         """How many scans ended so."""
@@ -62,6 +63,7 @@ class PlayReport:
         statuses = ("accepted", "dropped", "rejected", "unknown", "dropped_by_client")
         return {
             "n_scans": len(self.scans),
+            "failure": None if self.failure is None else str(self.failure) or "interrupted",
             "counts": {status: self.count(status) for status in statuses},
             "elapsed_s": self.elapsed_s,
             "held_out": None if self.held_out is None else self.held_out._asdict(),
@@ -96,11 +98,12 @@ def play(
         max_test_points: Score a fixed-seed sample when there are more.
         on_outcome: Called with every outcome as it is known, on a thread of the client's.
     Raises:
-        PotclientError: no server, or it vanished; DatasetError: a file is damaged.
+        PotclientError, KeyboardInterrupt: before the first scan was sent; later the report has them as `failure`.
     """
     started = time.monotonic()
     book = _Book(on_outcome)
     labelled: list[LabelledPoints] = []
+    failure: PotclientError | KeyboardInterrupt | None = None
     previous, client.on_receipt = client.on_receipt, book.on_receipt
     try:
         for index, recorded in enumerate(recording):
@@ -116,10 +119,14 @@ def play(
             else:
                 book.publish(client, robot, index, scan, stamp_ns, wait=lossless)
         client.flush()  # ends: a credit without a receipt runs out
+    except (PotclientError, KeyboardInterrupt) as error:
+        if book.is_empty:
+            raise
+        failure = error
     finally:
         client.on_receipt = previous
-    report = PlayReport(scans=book.finish(lossless), elapsed_s=time.monotonic() - started)
-    if hold_out is None:
+    report = PlayReport(scans=book.finish(lossless), elapsed_s=time.monotonic() - started, failure=failure)
+    if hold_out is None or failure is not None:
         return report
     labels = LabelledPoints.concatenate(labelled)
     return dataclasses.replace(
@@ -213,6 +220,12 @@ class _Book:
             self._outcomes[outcome.index] = outcome
         if self._on_outcome is not None:
             self._on_outcome(outcome)
+
+    @property
+    def is_empty(self) -> bool:
+        """Nothing was sent."""
+        with self._lock:
+            return not self._sent and not self._outcomes
 
     def finish(self, lossless: bool) -> list[ScanOutcome]:
         """All outcomes in order; a scan without a receipt is unknown, or was dropped by the client where it may do so."""

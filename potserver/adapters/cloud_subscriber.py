@@ -7,6 +7,7 @@ import zenoh
 from potschemas import keys, messages
 from potserver.adapters import codec
 from potserver.adapters.intake import CloudJob, IntakeQueue
+from potserver.adapters.key_exprs import sender_of
 from potserver.adapters.limits import Limits
 from potserver.adapters.log import get_logger
 from potserver.adapters.receipts import ReceiptSender
@@ -50,8 +51,12 @@ class CloudSubscriber:
         if sample.kind == zenoh.SampleKind.DELETE:
             self._health.count("clouds.deletes_ignored")
             return
+        robot_id = sender_of(sample.key_expr)
+        if robot_id is None:  # nobody to send a receipt to
+            self._health.count("clouds.rejected.bad_key")
+            return
         self._health.count("clouds.received")
-        job = CloudJob(robot_id=keys.robot_of(str(sample.key_expr)), payload=sample.payload)
+        job = CloudJob(robot_id=robot_id, payload=sample.payload)
         try:
             codec.check_size(job.n_bytes, self._limits.max_cloud_bytes, "cloud")
             codec.check_robot_id(job.lane, self._allowed_robots)

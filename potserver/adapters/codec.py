@@ -27,6 +27,7 @@ from potserver.domain.types import (
     Occupancy,
     Scan,
     SectorMatch,
+    TileChange,
     check_rigid,
 )
 from potserver.errors import (
@@ -418,16 +419,18 @@ def encode_params(*, map_id: str, scan: Scan, update: MapUpdate, rule: AnswerRul
     )
 
 
-def encode_revision(*, map_id: str, update: MapUpdate, stamp_ns: int) -> Wire:
+def encode_revision(
+    *, map_id: str, map_revision: int, map_kernels: int, changed: TileChange, stamp_ns: int
+) -> Wire:
     """The tick of `ev/revision`."""
     return _wire(
         messages.Revision(
             map=map_id,
-            map_revision=int(update.map_revision),
+            map_revision=int(map_revision),
             stamp_ns=stamp_ns,
-            n_kernels=int(update.map_kernels),
-            tile_size_m=float(update.changed.tile_size_m),
-            changed_tiles=[[int(i) for i in tile] for tile in update.changed.tiles],
+            n_kernels=int(map_kernels),
+            tile_size_m=float(changed.tile_size_m),
+            changed_tiles=[[int(i) for i in tile] for tile in changed.tiles],
         )
     )
 

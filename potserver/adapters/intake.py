@@ -6,7 +6,7 @@ import collections
 import dataclasses
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import zenoh
@@ -68,8 +68,9 @@ class _Epoch:
 class IntakeQueue:
     """Many producers that never wait, one consumer: the map's writer.
 
-    When it is full, the newest cloud of the robot that holds most places makes room for a robot that holds at
-    least two fewer; otherwise the newcomer is refused. Either way somebody is told at once.
+    When it is full, the newest clouds of the robot that holds most of what is short, places or bytes, make room
+    for a robot that will still hold no more than it; otherwise, or if even that is not enough, the newcomer is
+    refused and nobody loses a place. Either way somebody is told at once.
 
     Args:
         max_queued: Clouds.
@@ -81,7 +82,8 @@ class IntakeQueue:
         self._max_queued, self._max_bytes, self._retry_after_s = max_queued, max_queued_bytes, retry_after_s
         self._changed = threading.Condition()
         self._epochs: collections.deque[_Epoch] = collections.deque([_Epoch()])
-        self._counts: collections.Counter[str] = collections.Counter()
+        self._counts: collections.Counter[str] = collections.Counter()  # clouds of each lane
+        self._sizes: collections.Counter[str] = collections.Counter()  # bytes of each lane
         self._n_bytes = 0
         self._busy = False
         self._admitting, self._closed = True, False
@@ -113,24 +115,25 @@ class IntakeQueue:
         with self._changed:
             if not self._admitting:
                 return [Refusal(job, ShuttingDownError("the server takes no more clouds"))]
-            refused = []
-            while (
-                self._counts.total() + 1 > self._max_queued or self._n_bytes + job.n_bytes > self._max_bytes
-            ):
-                victim = self._newest_of_heaviest(job.lane)
-                refused.append(Refusal(victim or job, self._overloaded()))
-                if victim is None:
-                    return refused
+            victims = self._make_room(job)
+            error = self._overloaded()
+            if victims is None:
+                return [Refusal(job, error)]
+            for victim in victims:
                 self._forget(victim)
             self._epochs[-1].lanes.setdefault(job.lane, collections.deque()).append(job)
             self._counts[job.lane] += 1
+            self._sizes[job.lane] += job.n_bytes
             self._n_bytes += job.n_bytes
             self._changed.notify_all()
-            return refused
+            return [Refusal(victim, error) for victim in victims]
 
-    def admit_barrier(self, barrier: Barrier) -> None:
+    def admit_barrier(self, barrier: Barrier, *, is_last: bool = False) -> None:
         """Queue work that follows all clouds queued so far.
 
+        Args:
+            barrier: The work.
+            is_last: Take no clouds after it.
         Raises:
             OverloadedError: too many barriers wait already.
             ShuttingDownError: the queue is closed.
@@ -142,6 +145,8 @@ class IntakeQueue:
                 raise OverloadedError(
                     f"{_MAX_BARRIERS} control requests wait already", retry_after_s=self._retry_after_s
                 )
+            if is_last:
+                self._admitting = False
             self._epochs[-1].barrier = barrier
             self._epochs.append(_Epoch())
             self._changed.notify_all()
@@ -192,6 +197,7 @@ class IntakeQueue:
             barriers = [epoch.barrier for epoch in self._epochs if epoch.barrier is not None]
             self._epochs = collections.deque([_Epoch()])
             self._counts.clear()
+            self._sizes.clear()
             self._n_bytes = 0
             self._changed.notify_all()
             return clouds, barriers
@@ -203,13 +209,29 @@ class IntakeQueue:
             retry_after_s=self._retry_after_s,
         )
 
-    def _newest_of_heaviest(self, newcomer: str) -> CloudJob | None:
-        if not self._counts:
-            return None
-        lane, count = self._counts.most_common(1)[0]
-        if count < self._counts[newcomer] + 2:
-            return None
-        return next(epoch.lanes[lane][-1] for epoch in reversed(self._epochs) if lane in epoch.lanes)
+    def _make_room(self, job: CloudJob) -> list[CloudJob] | None:
+        """Clouds whose places the newcomer may have; None if it should not, or would still not fit."""
+        counts, sizes = self._counts.copy(), self._sizes.copy()
+        newest: dict[str, Iterator[CloudJob]] = {}
+        victims: list[CloudJob] = []
+        while True:
+            lacks_bytes = sizes.total() + job.n_bytes > self._max_bytes
+            if not lacks_bytes and counts.total() + 1 <= self._max_queued:
+                return victims
+            held, wanted = (sizes, job.n_bytes) if lacks_bytes else (counts, 1)
+            if not held.total():
+                return None
+            lane = held.most_common(1)[0][0]
+            victim = next(newest.setdefault(lane, self._newest_first(lane)))
+            counts[lane] -= 1
+            sizes[lane] -= victim.n_bytes
+            if lane == job.lane or held[lane] < held[job.lane] + wanted:
+                return None
+            victims.append(victim)
+
+    def _newest_first(self, lane: str) -> Iterator[CloudJob]:
+        for epoch in reversed(self._epochs):
+            yield from reversed(epoch.lanes.get(lane, ()))
 
     def _forget(self, job: CloudJob) -> None:
         for epoch in self._epochs:
@@ -225,4 +247,7 @@ class IntakeQueue:
         self._counts[job.lane] -= 1
         if not self._counts[job.lane]:
             del self._counts[job.lane]
+        self._sizes[job.lane] -= job.n_bytes
+        if not self._sizes[job.lane]:
+            del self._sizes[job.lane]
         self._n_bytes -= job.n_bytes

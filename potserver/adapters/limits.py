@@ -13,7 +13,7 @@ class Limits:
     max_cloud_points: int = 400_000
     max_query_bytes: int = 4 * 2**20
     max_query_points: int = 200_000
-    max_grid_cells: int = 20_000_000
+    max_grid_cells: int = 4_000_000
     max_coordinate_m: float = 2.0e7  # each coordinate in the map frame; UTM northings end at 1e7
     max_robots: int = 1024  # robots remembered at once: stamps, poses, presence
 

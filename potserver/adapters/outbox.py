@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import collections
+import enum
 import threading
 import time
 from collections.abc import Callable
@@ -13,6 +14,17 @@ from potserver.adapters.threads import spawn
 log = get_logger("potserver.outbox")
 
 Task = Callable[[], None]
+
+
+class End(enum.Enum):
+    """How a task ended."""
+
+    SENT = "sent"
+    FAILED = "failed"
+    ABANDONED = "abandoned"  # the outbox was closed first
+
+
+Ended = Callable[[End], None]
 
 
 class Outbox:
@@ -31,7 +43,7 @@ class Outbox:
         self._name = name
         self._max_pending, self._max_bytes = max_pending, max_pending_bytes
         self._changed = threading.Condition()
-        self._tasks: collections.deque[tuple[Task, int]] = collections.deque()
+        self._tasks: collections.deque[tuple[Task, int, Ended | None]] = collections.deque()
         self._n_bytes = 0
         self._busy = self._closed = False
         self._thread = spawn(name, self._run)
@@ -42,16 +54,16 @@ class Outbox:
         with self._changed:
             return len(self._tasks)
 
-    def post(self, task: Task, n_bytes: int = 0) -> None:
+    def post(self, task: Task, n_bytes: int = 0, *, ended: Ended | None = None) -> None:
         """Queue what must be sent; waits while the queue is full, which slows down whoever causes it."""
         with self._changed:
             self._changed.wait_for(lambda: self._closed or not self._is_full())
-            self._append(task, n_bytes)
+            self._append(task, n_bytes, ended)
 
-    def post_now(self, task: Task, n_bytes: int = 0) -> None:
+    def post_now(self, task: Task, n_bytes: int = 0, *, ended: Ended | None = None) -> None:
         """Queue what must be sent, even beyond the bound: for callers whose rate is bounded, like the mapper."""
         with self._changed:
-            self._append(task, n_bytes)
+            self._append(task, n_bytes, ended)
 
     def offer(self, task: Task, n_bytes: int = 0) -> bool:
         """Queue what may be dropped; False if the queue is full, for the caller to count."""
@@ -67,7 +79,9 @@ class Outbox:
         with self._changed:
             emptied = self._changed.wait_for(lambda: not (self._tasks or self._busy), timeout_s)
             self._closed = True
-            self._tasks.clear()  # nobody will send them
+            for _, _, ended in self._tasks:  # nobody will send them
+                _tell(ended, End.ABANDONED)
+            self._tasks.clear()
             self._changed.notify_all()
         self._thread.join(max(0.0, deadline - time.monotonic()))
         return emptied
@@ -75,10 +89,11 @@ class Outbox:
     def _is_full(self) -> bool:
         return len(self._tasks) >= self._max_pending or self._n_bytes >= self._max_bytes
 
-    def _append(self, task: Task, n_bytes: int) -> None:
+    def _append(self, task: Task, n_bytes: int, ended: Ended | None = None) -> None:
         if self._closed:
+            _tell(ended, End.ABANDONED)
             return
-        self._tasks.append((task, n_bytes))
+        self._tasks.append((task, n_bytes, ended))
         self._n_bytes += n_bytes
         self._changed.notify_all()
 
@@ -88,14 +103,21 @@ class Outbox:
                 self._changed.wait_for(lambda: self._tasks or self._closed)
                 if self._closed:
                     return
-                task, n_bytes = self._tasks.popleft()
+                task, n_bytes, ended = self._tasks.popleft()
                 self._busy = True
             try:
                 task()
+                _tell(ended, End.SENT)
             except Exception:
                 log.exception("send_failed", outbox=self._name)
+                _tell(ended, End.FAILED)
             finally:
                 with self._changed:
                     self._busy = False
                     self._n_bytes -= n_bytes
                     self._changed.notify_all()
+
+
+def _tell(ended: Ended | None, end: End) -> None:
+    if ended is not None:
+        ended(end)

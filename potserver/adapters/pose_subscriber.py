@@ -6,6 +6,7 @@ import zenoh
 
 from potschemas import keys, messages
 from potserver.adapters import codec
+from potserver.adapters.key_exprs import sender_of
 from potserver.adapters.log import get_logger
 from potserver.adapters.poses import PoseBuffer
 from potserver.errors import PotserverError
@@ -37,8 +38,12 @@ class PoseSubscriber:
     def run(self) -> None:
         """Take samples until undeclared, on a thread of our own."""
         for sample in self._subscriber:
+            robot_id = sender_of(sample.key_expr)
+            if robot_id is None:
+                self._health.count("poses.rejected.bad_key")
+                continue
             try:
-                self._add(sample)
+                self._add(robot_id, sample)
                 self._health.count("poses.accepted")
             except PotserverError as error:
                 self._health.count(f"poses.rejected.{error.code}")
@@ -51,9 +56,8 @@ class PoseSubscriber:
         """Take no more; ends `run`."""
         self._subscriber.undeclare()
 
-    def _add(self, sample: zenoh.Sample) -> None:
+    def _add(self, robot_id: str, sample: zenoh.Sample) -> None:
         self._health.count("poses.received")
-        robot_id = keys.robot_of(str(sample.key_expr))
         codec.check_robot_id(robot_id, self._allowed_robots)
         codec.check_encoding(str(sample.encoding), messages.Pose)
         codec.check_size(len(sample.payload), _MAX_POSE_BYTES, "pose")

@@ -10,6 +10,7 @@ import time
 import numpy as np
 from numpy.typing import NDArray
 
+from potserver.adapters.stamps import check_not_future
 from potserver.domain.types import Float64, check_rigid
 from potserver.errors import NoPoseError
 
@@ -21,11 +22,20 @@ class PoseBuffer:
         max_per_robot: Poses kept; 1024 are 20 s at 50 Hz.
         max_robots: Robots kept; the one that has been silent longest goes first.
         max_gap_s: Two poses further apart than this are not interpolated between.
+        max_future_s: Poses further ahead of our clock are refused.
     """
 
-    def __init__(self, *, max_per_robot: int = 1024, max_robots: int = 1024, max_gap_s: float = 0.5) -> None:
+    def __init__(
+        self,
+        *,
+        max_per_robot: int = 1024,
+        max_robots: int = 1024,
+        max_gap_s: float = 0.5,
+        max_future_s: float = 5.0,
+    ) -> None:
         self._max_per_robot, self._max_robots = max_per_robot, max_robots
         self._max_gap_ns = int(max_gap_s * 1e9)
+        self._max_future_s = max_future_s
         self._changed = threading.Condition()
         self._tracks: collections.OrderedDict[str, _Track] = collections.OrderedDict()
 
@@ -34,8 +44,10 @@ class PoseBuffer:
 
         Raises:
             BadPoseError: the pose is not rigid.
+            OldStampError: the stamp is too far in the future.
         """
         check_rigid(T_map_sensor)
+        check_not_future(stamp_ns, self._max_future_s)
         with self._changed:
             track = self._tracks.setdefault(robot_id, _Track())
             self._tracks.move_to_end(robot_id)
@@ -80,10 +92,15 @@ class _Track:
         if i < len(self.stamps) and self.stamps[i] == stamp_ns:
             self.poses[i] = pose
             return
+        if len(self.stamps) == max_poses:
+            # no late pose is that late: the robot's clock went back, or its log starts again
+            if i < max(1, max_poses // 2):
+                self.stamps, self.poses = [stamp_ns], [pose]
+                return
+            del self.stamps[0], self.poses[0]
+            i -= 1
         self.stamps.insert(i, stamp_ns)
         self.poses.insert(i, pose)
-        if len(self.stamps) > max_poses:
-            del self.stamps[0], self.poses[0]
 
     def at(self, stamp_ns: int, max_gap_ns: int) -> Float64:
         after = bisect.bisect_left(self.stamps, stamp_ns)

@@ -7,8 +7,9 @@ import threading
 import zenoh
 
 from potschemas import keys
+from potserver.adapters.key_exprs import sender_of
 from potserver.adapters.log import get_logger
-from potserver.errors import PotserverError
+from potserver.services.health import Health
 
 log = get_logger("potserver.presence")
 
@@ -27,8 +28,10 @@ class ServerToken:
 class RobotWatch:
     """Which robots hold a token for a map."""
 
-    def __init__(self, session: zenoh.Session, map_keys: keys.MapKeys, *, max_robots: int) -> None:
-        self._map_id, self._max_robots = map_keys.map_id, max_robots
+    def __init__(
+        self, session: zenoh.Session, map_keys: keys.MapKeys, *, health: Health, max_robots: int
+    ) -> None:
+        self._map_id, self._health, self._max_robots = map_keys.map_id, health, max_robots
         self._lock = threading.Lock()
         self._alive: set[str] = set()
         self._subscriber = session.liveliness().declare_subscriber(
@@ -45,16 +48,18 @@ class RobotWatch:
         """Follow the tokens until undeclared, on a thread of our own."""
         for sample in self._subscriber:
             try:
-                self._note(sample)
-            except (PotserverError, ValueError) as error:
+                robot_id = keys.check_id(sender_of(sample.key_expr) or "", "robot")
+            except ValueError as error:
+                self._health.count("presence.rejected.bad_key")
                 log.debug("robot_token_ignored", key=str(sample.key_expr), detail=str(error))
+            else:
+                self._note(robot_id, sample)
 
     def undeclare(self) -> None:
         """Follow no more; ends `run`."""
         self._subscriber.undeclare()
 
-    def _note(self, sample: zenoh.Sample) -> None:
-        robot_id = keys.check_id(keys.robot_of(str(sample.key_expr)), "robot")
+    def _note(self, robot_id: str, sample: zenoh.Sample) -> None:
         with self._lock:
             if sample.kind == zenoh.SampleKind.DELETE:
                 known = robot_id in self._alive

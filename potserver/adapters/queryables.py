@@ -17,18 +17,20 @@ import zenoh
 from potschemas import keys, messages
 from potserver.adapters import codec
 from potserver.adapters.intake import Barrier, CloudJob, IntakeQueue
+from potserver.adapters.key_exprs import is_wild
 from potserver.adapters.limits import Limits
 from potserver.adapters.log import get_logger
 from potserver.adapters.outbox import Outbox
 from potserver.adapters.ports import Asker, Mapper
 from potserver.adapters.query_pool import QueryJob, QueryPool
 from potserver.adapters.receipts import ReceiptSender
-from potserver.errors import DeadlineError, PotserverError, UnsupportedError
+from potserver.errors import DeadlineError, PotserverError, ShuttingDownError, UnsupportedError
 from potserver.services.health import Health
 
 log = get_logger("potserver.queries")
 
 INTEGRATE = "integrate"
+_SHORT = ("atoms", "info")  # answered past the grids that wait
 _BACKLOG = 64  # queries between Zenoh and our admission; admission takes microseconds
 _BUG = "a bug of the server; the traceback is in its log"
 
@@ -108,12 +110,13 @@ class MapQueryable:
                 answer=lambda arrived_s: self._answer(query, op, handler, arrived_s),
                 refuse=lambda error: self._refuse(query, op, error),
                 n_bytes=n_bytes,
+                is_short=op in _SHORT,
             )
         )
         return op
 
     def _admit_cloud(self, query: zenoh.Query) -> None:
-        if _is_wild(query):
+        if is_wild(query.key_expr):
             raise UnsupportedError("integrate changes a map: name the map, wildcards are not taken")
         self._health.count("clouds.received")
         job = CloudJob(robot_id=None, payload=query.payload or zenoh.ZBytes(b""), query=query)
@@ -121,10 +124,10 @@ class MapQueryable:
             codec.check_size(job.n_bytes, self._limits.max_cloud_bytes, "cloud")
             codec.check_encoding(_encoding(query), messages.Cloud)
         except PotserverError as error:
-            self._receipts.refuse(job, error, patient=True)
+            self._receipts.refuse(job, error)
             return
         for refused, why in self._intake.admit(job):
-            self._receipts.refuse(refused, why, patient=True)
+            self._receipts.refuse(refused, why)
 
     # --- answers, on a worker thread ------------------------------------------------------------------------
 
@@ -147,6 +150,8 @@ class MapQueryable:
                 except PotserverError as error:  # expected: the asker gets a typed reply
                     self._reply_error(query, op, error)
                 except Exception:  # a bug: the traceback stays here
+                    if self._pool.is_closing:  # the pool has cut the query off
+                        return
                     log.exception("query_failed", key=self._keys.query(op))
                     self._reply_error(query, op, PotserverError(_BUG))
         except Exception:
@@ -164,6 +169,7 @@ class MapQueryable:
             request.lower, request.upper, request.resolution, part_cells=self._grid_part_cells
         )
         for part in range(plan.n_parts):
+            self._check_may_go_on(arrived_s, request.deadline_ms)
             first_cell, occupancy = plan.part(part)
             yield codec.encode_grid_part(
                 part=part,
@@ -183,6 +189,7 @@ class MapQueryable:
         )
         snapshot = self._mapper.snapshot
         for part, kernels in enumerate(parts):
+            self._check_may_go_on(arrived_s, request.deadline_ms)
             yield codec.encode_params_part(
                 part=part,
                 n_parts=len(parts),
@@ -190,6 +197,17 @@ class MapQueryable:
                 kernels=kernels,
                 rule=snapshot.rule,
             )
+
+    def _check_may_go_on(self, arrived_s: float, deadline_ms: float | None) -> None:
+        """Between the parts of an answer.
+
+        Raises:
+            DeadlineError: the asker waits no longer.
+            ShuttingDownError: nor does the server.
+        """
+        _check_deadline(arrived_s, deadline_ms)
+        if self._pool.is_closing:
+            raise ShuttingDownError("the server is closing")
 
     def _atoms(self, payload: bytes, _arrived_s: float) -> Iterator[codec.Wire]:
         atom_id = codec.decode_atoms_query(payload)
@@ -235,11 +253,13 @@ class ControlQueryable:
         mapper: Mapper,
         intake: IntakeQueue,
         clear: Callable[[], None],
+        withdraw: Callable[[], None],
         prompt: Outbox,
         health: Health,
         limits: Limits,
     ) -> None:
-        self._keys, self._mapper, self._intake, self._clear = map_keys, mapper, intake, clear
+        self._keys, self._mapper, self._intake = map_keys, mapper, intake
+        self._clear, self._withdraw = clear, withdraw
         self._prompt, self._health, self._limits = prompt, health, limits
         self._queryable = session.declare_queryable(
             map_keys.control("*"), zenoh.handlers.FifoChannel(4), complete=True
@@ -262,7 +282,7 @@ class ControlQueryable:
         self._queryable.undeclare()
 
     def _admit(self, query: zenoh.Query, verb: str) -> None:
-        if _is_wild(query):
+        if is_wild(query.key_expr):
             raise UnsupportedError(
                 "control changes a map: name the map and the verb, wildcards are not taken"
             )
@@ -292,16 +312,20 @@ class ControlQueryable:
             else:
                 self._done(query, verb)
 
-        if verb == "drain":
-            self._intake.stop_admitting()
+        is_drain = verb == "drain"
+        self._intake.admit_barrier(
+            Barrier(run, lambda error: self._refuse(query, verb, error)), is_last=is_drain
+        )
+        if is_drain:
+            self._withdraw()
             log.info("map_draining", map_id=self._keys.map_id)
-        self._intake.admit_barrier(Barrier(run, lambda error: self._refuse(query, verb, error)))
 
     def _done(self, query: zenoh.Query, verb: str) -> None:
         snapshot = self._mapper.snapshot
-        done = {"clear": "the map is empty", "drain": "all clouds are in the map, and no more are taken"}[
-            verb
-        ]
+        done = {
+            "clear": "the map is empty",
+            "drain": "all clouds are in the map; only a restart of the server takes clouds again",
+        }[verb]
         self._health.count(f"control.{verb}.ok")
 
         def send() -> None:
@@ -366,7 +390,7 @@ def _reply_err(query: zenoh.Query, error: PotserverError) -> None:
 
 def _check_deadline(arrived_s: float, deadline_ms: float | None) -> None:
     if deadline_ms is not None and (waited_ms := (time.monotonic() - arrived_s) * 1e3) > deadline_ms:
-        raise DeadlineError(f"the query waited {waited_ms:.1f} ms, its deadline was {deadline_ms:.1f} ms")
+        raise DeadlineError(f"{waited_ms:.1f} ms since the query came, its deadline was {deadline_ms:.1f} ms")
 
 
 def _last_chunk(query: zenoh.Query) -> str:
@@ -377,11 +401,6 @@ def _op_of(query: zenoh.Query, known: tuple[str, ...]) -> str | None:
     """The operation that a query names. The map may be a wildcard, the operation may not."""
     last = _last_chunk(query)
     return last if last in known else None
-
-
-def _is_wild(query: zenoh.Query) -> bool:
-    key = str(query.key_expr)
-    return "*" in key or "$" in key
 
 
 def _encoding(query: zenoh.Query) -> str | None:

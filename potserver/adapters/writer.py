@@ -5,6 +5,8 @@ from __future__ import annotations
 import collections
 import time
 
+import numpy as np
+
 from potserver.adapters import codec
 from potserver.adapters.intake import CloudJob, IntakeQueue
 from potserver.adapters.limits import Limits
@@ -12,7 +14,8 @@ from potserver.adapters.log import get_logger
 from potserver.adapters.ports import Mapper
 from potserver.adapters.poses import PoseBuffer
 from potserver.adapters.receipts import ReceiptSender
-from potserver.domain.types import Float64, Scan
+from potserver.adapters.stamps import check_not_future
+from potserver.domain.types import Float64, Scan, TileChange
 from potserver.errors import OldStampError, PotserverError
 from potserver.services.health import Health
 
@@ -34,13 +37,14 @@ class MapWriter:
         limits: Limits,
         allowed_robots: frozenset[str],
         allow_old_stamps: bool,
+        max_future_s: float,
         pose_wait_s: float,
     ) -> None:
         self._map_id = map_id
         self._mapper, self._intake, self._receipts = mapper, intake, receipts
         self._poses, self._health, self._limits = poses, health, limits
         self._allowed_robots, self._allow_old_stamps = allowed_robots, allow_old_stamps
-        self._pose_wait_s = pose_wait_s
+        self._max_future_s, self._pose_wait_s = max_future_s, pose_wait_s
         self._last_stamps: collections.OrderedDict[str, int] = collections.OrderedDict()
 
     def run(self) -> None:
@@ -57,10 +61,19 @@ class MapWriter:
                 self._intake.done()
 
     def clear(self) -> None:
-        """Empty the map; runs on the writer thread, as a barrier."""
+        """Empty the map and tell the planners; runs on the writer thread, as a barrier."""
+        former = self._mapper.snapshot.kernels.hinge_mean
         self._mapper.clear()
         self._last_stamps.clear()  # the same log may be replayed into the empty map
         self._health.count("maps.cleared")
+        size = self._mapper.settings.tile_size_m
+        tiles = np.unique(np.floor(former / size).astype(np.int64), axis=0)
+        snapshot = self._mapper.snapshot
+        self._receipts.tick(
+            snapshot.map_revision,
+            len(snapshot),
+            TileChange(size, [(int(x), int(y), int(z)) for x, y, z in tiles]),
+        )
         log.info("map_cleared", map_id=self._map_id)
 
     def _integrate(self, job: CloudJob) -> None:
@@ -103,6 +116,8 @@ class MapWriter:
         return self._poses.at(robot_id, stamp_ns, wait_s=self._pose_wait_s)
 
     def _check_stamp(self, scan: Scan) -> None:
+        # one wild stamp that we remembered would shut its robot out until the clock reaches it
+        check_not_future(scan.stamp_ns, self._max_future_s)
         last = self._last_stamps.get(scan.robot_id)
         if last is not None and scan.stamp_ns <= last and not self._allow_old_stamps:
             behind_ms = (last - scan.stamp_ns) / 1e6

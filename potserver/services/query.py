@@ -50,7 +50,7 @@ class QueryService:
         mapping: MappingService,
         *,
         max_points: int = 200_000,
-        max_grid_cells: int = 20_000_000,
+        max_grid_cells: int = 4_000_000,
         max_coordinate_m: float = 1e7,
     ) -> None:
         """Bound what may be asked: points of a query, cells of a grid, and the largest absolute coordinate."""

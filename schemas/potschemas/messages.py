@@ -204,7 +204,7 @@ class PointsQuery(Message, frozen=True, kw_only=True):
     schema: ClassVar[str] = "pot.points_query.v1"
 
     points: Array  # (N, 3) or (N, 2) float32 or float64, m, map frame
-    deadline_ms: Positive | None = None  # ms from arrival; past it the work is not started
+    deadline_ms: Positive | None = None  # ms from arrival; past it no work and no part begins
 
 
 class Occupancy(Message, frozen=True, kw_only=True):
@@ -228,7 +228,7 @@ class GridQuery(Message, frozen=True, kw_only=True):
     lower: Vector3  # m, map frame; the box's corner, cell (0, 0, 0) starts here
     upper: Vector3  # m, map frame; above `lower` on every axis
     resolution: Positive  # m, cell edge
-    deadline_ms: Positive | None = None  # ms from arrival; past it the work is not started
+    deadline_ms: Positive | None = None  # ms from arrival; past it no work and no part begins
 
 
 class GridPart(Message, frozen=True, kw_only=True):
@@ -252,7 +252,7 @@ class ParamsQuery(Message, frozen=True, kw_only=True):
 
     lower: Vector3 | None = None  # m, map frame, on hinge means
     upper: Vector3 | None = None  # m, map frame; give both corners or neither
-    deadline_ms: Positive | None = None  # ms from arrival; past it the work is not started
+    deadline_ms: Positive | None = None  # ms from arrival; past it no work and no part begins
 
 
 class ParamsPart(Message, frozen=True, kw_only=True):

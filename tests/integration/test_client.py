@@ -12,8 +12,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+import zenoh
 
-from potclient.client import MapClient
+from potclient import feed
+from potclient.client import MapClient, _query_qos
 from potclient.datasets import open_dataset
 from potclient.errors import (
     BadReplyError,
@@ -45,6 +47,12 @@ LIMIT_S = 30.0  # of a wait that must succeed; no test measures it
 def server() -> Iterator[FakeServer]:
     with FakeServer() as server:
         yield server
+
+
+@pytest.fixture(autouse=True)
+def numbers_from_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Clouds that tests can name."""
+    monkeypatch.setattr(feed, "first_number", lambda: 1)
 
 
 @pytest.fixture
@@ -152,6 +160,63 @@ def test_rejections_are_counted_with_their_reason(server: FakeServer, client: Ma
     receipts = list(client.receipts(timeout_s=LIMIT_S))
     assert [(r.status, r.reason) for r in receipts] == [(ReceiptStatus.REJECTED, "overloaded")]
     assert client.counts().rejected == 1
+
+
+def test_two_processes_with_one_robot_id_keep_their_own_receipts(
+    server: FakeServer, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.undo()  # numbers as they are
+    with MapClient(server.endpoint) as one, MapClient(server.endpoint) as other:
+        for client in (one, other):
+            client.publish(cloud(), pose(), robot="a", wait=True)
+            assert client.flush(LIMIT_S)
+        for _ in range(3):
+            other.publish(cloud(), pose(), robot="a", wait=True)
+        assert other.flush(LIMIT_S)
+        one.publish(cloud(), pose(), robot="a", wait=True)  # its receipt comes after those of the other's
+        assert one.flush(LIMIT_S)
+        assert (one.counts().accepted, other.counts().accepted) == (2, 4)
+    warnings = [record for record in caplog.records if "another process" in record.getMessage()]
+    assert 1 <= len(warnings) <= 2, "once a client"
+
+
+def test_a_closed_subscription_is_forgotten(server: FakeServer, client: MapClient) -> None:
+    before = list(client._subscriptions)
+    for watch in (client.watch_revisions, client.watch_receipts, client.watch_stats, client.watch_params):
+        with watch(lambda _: None) as subscription:  # type: ignore[operator]
+            assert subscription in client._subscriptions
+        subscription.close()
+    assert client._subscriptions == before
+
+
+@pytest.mark.parametrize(
+    ("op", "priority", "is_express"),
+    [
+        ("points", zenoh.Priority.INTERACTIVE_HIGH, True),
+        ("info", zenoh.Priority.INTERACTIVE_HIGH, True),
+        ("grid", zenoh.Priority.DATA, False),
+        ("params", zenoh.Priority.DATA, False),
+        ("integrate", zenoh.Priority.DATA_LOW, False),
+    ],
+)
+def test_bulk_answers_do_not_take_the_lane_of_short_ones(
+    client: MapClient, op: str, priority: zenoh.Priority, is_express: bool
+) -> None:
+    lane = _query_qos(client.keys.query(op))
+    assert (lane["priority"], lane["express"]) == (priority, is_express)
+
+
+def test_a_message_of_another_kind_is_one_warning_line(
+    server: FakeServer, client: MapClient, caplog: pytest.LogCaptureFixture
+) -> None:
+    ticks: queue.Queue[Any] = queue.Queue()
+    with client.watch_revisions(ticks.put):
+        client.info()  # a round trip: the server knows of the subscription
+        server.session.put(client.keys.revision, b"\x93\x01\x02\x03")
+        client.publish(cloud(), pose(), wait=True)
+        ticks.get(timeout=LIMIT_S)
+    (record,) = [r for r in caplog.records if client.keys.revision in r.getMessage()]
+    assert (record.levelname, record.exc_info) == ("WARNING", None)
 
 
 def test_transported_parameters_arrive(server: FakeServer) -> None:
@@ -605,6 +670,25 @@ def test_a_scan_that_is_not_accepted_shows_in_the_report(server: FakeServer, cli
     assert [s.status for s in report.scans] == ["accepted", "rejected", "accepted"]
     assert report.to_json()["counts"]["rejected"] == 1
     assert client.on_receipt is None
+
+
+def test_a_recording_that_fails_midway_reports_what_was_sent(server: FakeServer, client: MapClient) -> None:
+    server.script.fail["integrate"] = ErrorCode.INTERNAL  # booked as rejected: the server answered
+    sent = 0
+
+    def close_after_two(_: Any) -> None:
+        nonlocal sent
+        sent += 1
+        if sent == 2:
+            client.close()
+
+    report = play(
+        client, open_dataset("generated:2d", n_generated=4), acknowledged=True, on_outcome=close_after_two
+    )
+    assert isinstance(report.failure, ClosedError)
+    assert report.to_json()["failure"] == "the client is closed"
+    assert [s.status for s in report.scans] == ["rejected", "rejected"]
+    assert not report.all_accepted
 
 
 def test_a_load_test_accounts_for_every_cloud(server: FakeServer) -> None:

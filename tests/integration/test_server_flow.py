@@ -10,6 +10,7 @@ import subprocess
 import sys
 import threading
 import time
+import types
 from collections.abc import Callable
 from typing import Any
 
@@ -20,6 +21,7 @@ import zenoh
 from potschemas import messages, wire
 from potschemas.keys import stats_key
 from potschemas.messages import ErrorCode, ReceiptStatus
+from potserver.adapters.intake import Barrier
 from potserver.config import load_settings
 from potserver.errors import EmptyError, SettingsError
 from potserver.server import MapServer
@@ -163,6 +165,7 @@ def test_every_cloud_of_a_flood_gets_exactly_one_receipt(make_rig: MakeRig) -> N
     assert stats.counters["clouds.dropped.overloaded"] == 36
     assert stats.counters["clouds.accepted"] == 4
     assert balance(stats.counters) == 0
+    until(lambda: client.stats().counters.get("receipts.sent") == 40, "all receipts counted")
     assert stats.queues["clouds.depth"] == 0
     assert receipts.empty()
 
@@ -197,6 +200,21 @@ def test_a_flooding_robot_does_not_shut_others_out(make_rig: MakeRig) -> None:
     rig.mapper.mapping.release()
     order = [(r.robot, r.seq) for r in drain(receipts, 5)]
     assert order == [("loud", 0), ("loud", 1), ("quiet", 0), ("loud", 2), ("loud", 3)]
+
+
+def test_a_refused_query_waits_for_no_outbox_and_keeps_no_bytes(make_rig: MakeRig) -> None:
+    size = len(wire.encode(make_cloud()))
+    rig = make_rig(limits__max_cloud_bytes=size - 1)
+    client = rig.client()
+    outbox = rig.server._nodes["default"].prompt
+    gate = threading.Event()
+    outbox.post_now(lambda: gate.wait(DEADLINE_S) and None, 2**40)  # full for all who wait
+    refused = [in_background(lambda: client.error("integrate", make_cloud(robot="r1"))) for _ in range(3)]
+    until(lambda: outbox.depth == 3, "three refusals behind the gate")
+    assert outbox._n_bytes == 2**40
+    assert client.one("info").n_kernels == 0, "the thread that admits is free"
+    gate.set()
+    assert {result().code for result in refused} == {ErrorCode.TOO_LARGE}
 
 
 def test_integrate_is_refused_at_once_when_the_queue_is_full(make_rig: MakeRig) -> None:
@@ -269,6 +287,72 @@ def test_work_past_its_deadline_is_not_started(make_rig: MakeRig) -> None:
     assert rig.mapper.queries.entered.qsize() == 1, "only the patient one reached the map"
 
 
+def _grid_of_parts(**changes: Any) -> messages.GridQuery:
+    return messages.GridQuery(lower=[0.0] * 3, upper=[2.0] * 3, resolution=0.5, **changes)  # 64 cells
+
+
+def test_a_grid_stops_between_its_parts_at_the_deadline(
+    make_rig: MakeRig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rig = make_rig(queries__grid_part_cells=16)
+    client = rig.client()
+    late_s = 0.0
+    clock = types.SimpleNamespace(monotonic=lambda: time.monotonic() + late_s)
+    monkeypatch.setattr("potserver.adapters.queryables.time", clock)
+    rig.mapper.queries.hold()
+    asked = in_background(lambda: client.ask("grid", _grid_of_parts(deadline_ms=1e6)))
+    rig.mapper.queries.wait_entered()
+    late_s = 1e4
+    rig.mapper.queries.release()
+    part, error = asked()
+    assert (part.n_parts, error.code) == (4, ErrorCode.DEADLINE)
+    counters = client.stats().counters
+    assert counters["queries.grid.deadline"] == 1
+    assert "queries.grid.ok" not in counters
+
+
+def test_a_grid_stops_between_its_parts_when_the_server_closes(make_rig: MakeRig) -> None:
+    rig = make_rig(queries__grid_part_cells=16)
+    client = rig.client()
+    rig.mapper.queries.hold()
+    asked = in_background(lambda: client.ask("grid", _grid_of_parts()))
+    rig.mapper.queries.wait_entered()
+    stopped = in_background(rig.server.stop)
+    until(lambda: rig.server._pool.is_closing, "the pool to close")
+    rig.mapper.queries.release()
+    part, error = asked()
+    assert (part.n_parts, error.code) == (4, ErrorCode.SHUTTING_DOWN)
+    assert stopped() is True
+    assert rig.server.health.counters()["queries.grid.shutting_down"] == 1
+
+
+def test_a_query_that_holds_its_worker_is_cut_off_with_an_answer_and_the_stop_is_not_clean(
+    make_rig: MakeRig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("potserver.server._FLUSH_S", 0.05)
+    rig = make_rig()
+    client = rig.client()
+    rig.mapper.queries.hold()
+    asked = in_background(lambda: client.error("points", HERE))
+    rig.mapper.queries.wait_entered()
+    assert rig.server.stop() is False
+    assert asked().code is ErrorCode.SHUTTING_DOWN
+    assert rig.server.health.counters()["queries.points.shutting_down"] == 1
+
+
+def test_info_does_not_wait_behind_grids(make_rig: MakeRig) -> None:
+    rig = make_rig(queries__threads=1)
+    client = rig.client()
+    rig.mapper.queries.hold()
+    grids = [in_background(lambda: client.ask("grid", _grid_of_parts())) for _ in range(3)]
+    rig.mapper.queries.wait_entered()
+    assert client.one("info").n_kernels == 0
+    assert client.one("atoms").atoms == []
+    rig.mapper.queries.release()
+    for grid in grids:
+        assert len(grid()) == 1
+
+
 def test_a_query_over_the_byte_limit_of_zenoh_itself_is_no_answer_at_all(make_rig: MakeRig) -> None:
     """The hard guard, far above our own limits, drops without a word: an empty reply is an error for every client."""
     settings = {"limits__max_query_bytes": 5000, "limits__max_cloud_bytes": 10_000}
@@ -292,15 +376,36 @@ def test_robots_off_the_allow_list_are_refused(make_rig: MakeRig) -> None:
     assert client.one("integrate", make_cloud(robot="r1")).status is ReceiptStatus.ACCEPTED
 
 
-def test_a_put_on_a_wild_key_is_refused_without_a_receipt_to_everybody(make_rig: MakeRig) -> None:
-    client = make_rig().client()
+def test_puts_on_wild_keys_are_counted_and_reach_nobody(
+    make_rig: MakeRig, caplog: pytest.LogCaptureFixture
+) -> None:
+    rig = make_rig()
+    client = rig.client()
     receipts = client.receipts()
-    cloud = make_cloud()
-    client.session.put(client.keys.cloud("*"), wire.encode(cloud), encoding=wire.encoding_of(cloud))
-    until(lambda: client.stats().counters.get("receipts.unaddressed") == 1, "the refusal")
-    assert client.stats().counters["clouds.rejected.unknown_robot"] == 1
+    cloud, pose = make_cloud(), _pose_message(1, 0.0)
+    wild = [client.keys.cloud("*"), client.keys.cloud("r$*"), f"{ROOT}/default/in/**"]
+    for key in wild:
+        client.session.put(key, wire.encode(cloud), encoding=wire.encoding_of(cloud))
+    client.session.put(client.keys.pose("*"), wire.encode(pose), encoding=wire.encoding_of(pose))
+
+    def both_refused() -> bool:
+        counters = client.stats().counters
+        return (counters.get("clouds.rejected.bad_key"), counters.get("poses.rejected.bad_key")) == (3, 2)
+
+    until(both_refused, "the refusals")
+    counters = client.stats().counters
+    assert not {"clouds.received", "poses.received"} & counters.keys()
     client.put_cloud(make_cloud(seq=1))
     assert receipts.get(timeout=DEADLINE_S).seq == 1
+    assert not [record for record in caplog.records if record.exc_info]
+
+
+def test_a_token_without_a_legal_robot_is_counted(make_rig: MakeRig) -> None:
+    client = make_rig().client()
+    token = client.session.liveliness().declare_token(client.keys.robot_token("Robot!"))
+    until(lambda: client.stats().counters.get("presence.rejected.bad_key") == 1, "the refusal")
+    assert client.stats().counters["robots.alive"] == 0
+    token.undeclare()
 
 
 def test_what_changes_a_map_must_name_it(make_rig: MakeRig) -> None:
@@ -320,6 +425,18 @@ def test_unknown_operations_and_verbs_are_unsupported(make_rig: MakeRig) -> None
     assert client.error("rays").code is ErrorCode.UNSUPPORTED
     assert client.control("save").code is ErrorCode.UNSUPPORTED
     assert client.stats().counters["queries.unknown.unsupported"] == 1
+
+
+def test_a_stamp_from_the_future_is_refused_and_not_remembered(make_rig: MakeRig) -> None:
+    client = make_rig().client()
+    wild = make_cloud(robot="r1", stamp_ns=time.time_ns() + 3600 * 10**9)
+    error = client.error("integrate", wild)
+    assert error.code is ErrorCode.OLD_STAMP
+    assert "ahead of the server's clock" in error.message
+    assert client.one("integrate", make_cloud(seq=1, robot="r1")).map_revision == 1
+    pose = _pose_message(2**62, 1.0)
+    client.put(client.keys.pose("r1"), wire.encode(pose), wire.encoding_of(pose))
+    until(lambda: client.stats().counters.get("poses.rejected.old_stamp") == 1, "the refusal")
 
 
 def test_old_stamps_may_be_allowed(make_rig: MakeRig) -> None:
@@ -405,6 +522,20 @@ def test_clear_comes_after_the_clouds_before_it_and_forgets_the_stamps(make_rig:
     assert client.one("info").n_scans == 1
 
 
+def test_clear_tells_the_planners_which_tiles_are_gone(make_rig: MakeRig) -> None:
+    rig = make_rig()
+    client = rig.client()
+    ticks = client.listen(client.keys.revision)
+    client.one("integrate", make_cloud(robot="r1"))
+    hinges = rig.mapper.snapshot.kernels.hinge_mean
+    former = {tuple(tile) for tile in np.floor(hinges / rig.mapper.settings.tile_size_m).astype(int).tolist()}
+    client.control("clear")
+    _, tick = drain(ticks, 2)
+    assert (tick.map_revision, tick.n_kernels, tick.tile_size_m) == (2, 0, 10.0)
+    assert {tuple(tile) for tile in tick.changed_tiles} == former
+    assert len(tick.changed_tiles) == len(former) > 1
+
+
 def test_a_control_request_may_give_up_waiting(make_rig: MakeRig) -> None:
     rig = make_rig()
     client = rig.client()
@@ -428,14 +559,32 @@ def test_drain_maps_what_waits_and_takes_no_more(make_rig: MakeRig) -> None:
     until(lambda: client.stats().queues["clouds.depth"] == 1, "one in work, one waiting")
     drained = in_background(lambda: client.control("drain"))
     until(lambda: client.stats().state == "draining", "the state")
+    until(lambda: client.alive(client.keys.server_token("potserver")) == [], "the token to go")
     client.put_cloud(make_cloud(seq=3))
     late = receipts.get(timeout=DEADLINE_S)
     assert (late.seq, late.status, late.reason) == (3, ReceiptStatus.DROPPED, "shutting_down")
     assert client.error("integrate", make_cloud(seq=4, robot="r1")).code is ErrorCode.SHUTTING_DOWN
     rig.mapper.mapping.release()
-    assert drained().map_revision == 2
+    reply = drained()
+    assert reply.map_revision == 2
+    assert "restart" in reply.message
     assert [r.seq for r in drain(receipts, 2)] == [1, 2]
     assert client.one("points", HERE).map_revision == 2, "questions are still answered"
+
+
+def test_a_drain_that_could_not_be_queued_has_not_drained(make_rig: MakeRig) -> None:
+    rig = make_rig()
+    client = rig.client()
+    rig.mapper.mapping.hold()
+    client.put_cloud(make_cloud())
+    rig.mapper.mapping.wait_entered()
+    intake = rig.server._nodes["default"].intake
+    for _ in range(16):
+        intake.admit_barrier(Barrier(lambda: None, lambda _: None))
+    assert client.control("drain").code is ErrorCode.OVERLOADED
+    rig.mapper.mapping.release()
+    assert client.one("integrate", make_cloud(seq=1, robot="r1")).map_revision == 2
+    assert client.alive(client.keys.server_token("potserver"))
 
 
 # --- presence and counters ----------------------------------------------------------------------------------

@@ -159,3 +159,10 @@ def test_services_depend_on_each_other_as_they_can(root: Path, compose: dict) ->
 def test_image_tags_are_the_version(compose: dict) -> None:
     for service in compose["services"].values():
         assert service["image"].partition(":")[2] == __version__
+
+
+def test_the_server_container_uses_no_shared_memory_and_keeps_only_a_cache(compose: dict) -> None:
+    server = compose["services"]["server"]
+    assert "--no-shm" in server["command"], "/dev/shm of a container is small"
+    assert set(compose["volumes"]) == {"cache"} == {v.split(":")[0] for v in server["volumes"]}
+    assert server["stop_grace_period"] == "30s"

@@ -294,6 +294,56 @@ def test_waiting_for_a_server_that_never_comes_ends(run: Run) -> None:
     assert "maps served here: default" in err
 
 
+@pytest.mark.parametrize(("error", "status"), [(KeyboardInterrupt(), 130), (NoServerError("gone"), 1)])
+def test_publish_that_ends_early_still_reports(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: BaseException, status: int
+) -> None:
+    publish, n = MapClient.publish, 0
+
+    def fail_at_the_third(self: MapClient, *args: Any, **kwargs: Any) -> int:
+        nonlocal n
+        n += 1
+        if n == 3:
+            assert self.flush(30)
+            raise error
+        return publish(self, *args, **kwargs)
+
+    monkeypatch.setattr(MapClient, "publish", fail_at_the_third)
+    target = tmp_path / "report.json"
+    got, out, err = run("publish", "generated:2d", "--limit", "5", "--json", str(target))
+    assert got == status
+    assert "2 of 2 scans accepted" in out
+    assert err.splitlines()[-1]
+    report = json.loads(target.read_text())
+    assert (report["n_scans"], report["failure"]) == (2, str(error) or "interrupted")
+
+
+def test_an_interrupted_load_reports_and_says_so(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    join, is_first = threading.Thread.join, True
+
+    def interrupted_once(self: threading.Thread, timeout: float | None = None) -> None:
+        nonlocal is_first
+        if is_first and threading.current_thread() is threading.main_thread():
+            is_first = False
+            raise KeyboardInterrupt
+        join(self, timeout)
+
+    monkeypatch.setattr("potclient.loadtest.threading.Thread.join", interrupted_once)
+    words = ["--robots", "1", "--planners", "0", "--seconds", "600", "--dataset", "generated:2d"]
+    status, out, err = run("load", *words)
+    assert status == 130
+    assert "clouds" in out
+    assert "interrupted" in err
+
+
+def test_control_help_names_the_verbs_there_are(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["--help"])
+    text = " ".join(capsys.readouterr().out.split())
+    assert "verb: clear, drain" in text
+    assert "save, load" not in text
+
+
 def test_load_prints_a_table_and_accounts_for_everything(run: Run, tmp_path: Path) -> None:
     words = ("--robots", "1", "--planners", "1", "--hz", "40", "--seconds", "0.3", "--points", "50")
     status, out, _ = run(

@@ -333,5 +333,7 @@ def test_a_sector_without_an_atom_still_travels() -> None:
     sent = codec.encode_params(map_id="m", scan=scan, update=update, rule=RULE)
     (report,) = wire.decode(sent.payload, messages.Params).sectors
     assert (report.atom_id, report.reason, report.n_hits) == (None, "no atom is comparable", 3)
-    tick = codec.encode_revision(map_id="m", update=update, stamp_ns=9)
+    tick = codec.encode_revision(
+        map_id="m", map_revision=3, map_kernels=9, changed=update.changed, stamp_ns=9
+    )
     assert wire.decode(tick.payload, messages.Revision).changed_tiles == [[-1, 2, 0]]

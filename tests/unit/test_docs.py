@@ -146,3 +146,12 @@ def test_links_in_the_documents_lead_somewhere(root: Path) -> None:
 )
 def test_commands_are_found(line: str, expected: list[list[str]]) -> None:
     assert list(commands(Block("console", line, 1))) == expected
+
+
+def test_no_document_has_a_placeholder_left(root: Path) -> None:
+    left = [
+        f"{path.name}: {found}"
+        for path in documents(root)
+        for found in re.findall(r"\b[A-Z]+_TABLE\b|TODO", path.read_text())
+    ]
+    assert not left

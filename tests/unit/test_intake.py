@@ -87,6 +87,36 @@ def test_room_is_made_for_a_robot_that_holds_much_less() -> None:
     assert [take(queue) for _ in range(3)] == [loud[0], first, loud[1]]
 
 
+def test_nobody_loses_a_place_to_a_newcomer_that_still_does_not_fit() -> None:
+    queue = queue_of(100, n_bytes=100)
+    loud, other = [job("loud", 20) for _ in range(3)], job("other", 40)
+    for each in (*loud, other):
+        queue.admit(each)
+    huge = job("quiet", 90)
+    assert [refusal.job for refusal in queue.admit(huge)] == [huge]
+    assert (queue.depth, queue.n_bytes) == (4, 100)
+
+
+def test_short_bytes_are_taken_from_who_holds_most_bytes() -> None:
+    queue = queue_of(100, n_bytes=100)
+    many_small, few_large = [job("small", 2) for _ in range(10)], [job("large", 40) for _ in range(2)]
+    for each in (*many_small, *few_large):
+        queue.admit(each)
+    newcomer = job("new", 30)
+    assert [refusal.job for refusal in queue.admit(newcomer)] == [few_large[1]]
+    assert queue.n_bytes == 90
+    assert queue.admit(job("new", 10)) == []
+    assert len(queue.admit(job("new", 10))) == 1, "it holds as much as the largest by now"
+
+
+def test_a_cloud_of_no_bytes_has_its_place() -> None:
+    queue = queue_of(1)
+    empty = job("a", 0)
+    assert queue.admit(empty) == []
+    assert len(queue.admit(job("b", 0))) == 1
+    assert take(queue) is empty
+
+
 def test_after_stop_admitting_only_what_is_queued_is_worked_off() -> None:
     queue = queue_of()
     kept, late = job(), job()

@@ -54,7 +54,7 @@ def make_feed(network: Network, credit: int = 2) -> Feed:
     return Feed(
         "r1",
         network.put,
-        numbering=Numbering(),
+        numbering=Numbering(first=1),
         is_matched=lambda: network.matched,
         credit=credit,
         receipt_timeout_s=5.0,
@@ -265,12 +265,18 @@ def test_closing_gives_every_cloud_an_outcome_and_wakes_waiters(network: Network
 
 
 def test_stamps_and_numbers_only_grow() -> None:
-    numbering = Numbering()
+    numbering = Numbering(first=1)
     first = numbering.assign(None, 2**62)  # far in the future
     second = numbering.assign(None, None)
     assert second == (first[0] + 1, first[1] + 1)
     assert numbering.assign(100, 5) == (100, 5), "what the caller says is sent as it is"
     assert numbering.assign(None, None)[0] == 101
+
+
+def test_two_processes_number_apart_and_within_the_wire() -> None:
+    starts = {Numbering().assign(None, None)[0] for _ in range(100)}
+    assert len(starts) == 100
+    assert max(starts) < 2**53, "exact in JSON, legal on the wire"
 
 
 @given(actions=st.lists(st.sampled_from(["offer", "accept", "reject", "lose", "stray"]), max_size=40))

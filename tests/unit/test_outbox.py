@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from potserver.adapters.outbox import Outbox
+from potserver.adapters.outbox import End, Outbox
 
 
 @pytest.fixture
@@ -65,6 +65,18 @@ def test_a_task_that_fails_does_not_end_the_thread(outbox: Outbox, caplog: pytes
     outbox.post(done.set)
     assert done.wait(10)
     assert any("send_failed" in str(record.msg) for record in caplog.records)
+
+
+def test_every_task_is_told_how_it_ended(outbox: Outbox) -> None:
+    ends: list[End] = []
+    outbox.post(lambda: None, ended=ends.append)
+    outbox.post(lambda: 1 / 0 and None, ended=ends.append)
+    gate = hold(outbox)
+    outbox.post_now(lambda: None, ended=ends.append)
+    assert not outbox.close(0.01)
+    outbox.post_now(lambda: None, ended=ends.append)
+    gate.set()
+    assert ends == [End.SENT, End.FAILED, End.ABANDONED, End.ABANDONED]
 
 
 def test_close_gives_up_in_time(outbox: Outbox) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import threading
+import time
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from hypothesis import strategies as st
 
 from potserver.adapters.poses import PoseBuffer, interpolate
 from potserver.domain.types import yaw_pose
-from potserver.errors import BadPoseError, NoPoseError
+from potserver.errors import BadPoseError, NoPoseError, OldStampError
 
 MS = 1_000_000
 
@@ -100,6 +101,27 @@ def test_it_is_bounded_in_poses_and_robots() -> None:
     with pytest.raises(NoPoseError, match="no pose stream"):
         poses.at("b", 0)
     assert poses.at("a", 10 * MS)[0, 3] == 10.0
+
+
+def test_a_full_track_starts_again_when_the_robots_clock_goes_back() -> None:
+    poses = PoseBuffer(max_per_robot=4)
+    for ms in (100, 110, 120, 130):
+        poses.add("r", ms * MS, yaw_pose(ms, 0, 0))
+    poses.add("r", 125 * MS, yaw_pose(125, 0, 0))
+    assert poses.at("r", 125 * MS)[0, 3] == 125.0, "a late pose finds its place"
+    for ms in (10, 20):
+        poses.add("r", ms * MS, yaw_pose(ms, 0, 0))
+    assert poses.at("r", 15 * MS)[0, 3] == pytest.approx(15.0)
+    with pytest.raises(NoPoseError, match="ends"):
+        poses.at("r", 120 * MS)
+
+
+def test_a_pose_from_the_future_is_refused() -> None:
+    poses = PoseBuffer(max_future_s=5.0)
+    with pytest.raises(OldStampError, match="ahead"):
+        poses.add("r", time.time_ns() + 3600 * 10**9, yaw_pose(0, 0, 0))
+    with pytest.raises(NoPoseError, match="no pose stream"):
+        poses.at("r", 0)
 
 
 def test_a_pose_that_is_not_rigid_is_refused() -> None:

@@ -187,3 +187,11 @@ def test_the_settings_that_are_logged_are_json() -> None:
     from potserver.config import as_tree
 
     json.dumps(as_tree(Settings()))
+
+
+def test_serve_help_says_who_may_write(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        cli.main(["serve", "--help"])
+    text = " ".join(capsys.readouterr().out.split())
+    assert "Anyone who reaches the port may write: use Zenoh's access control and TLS." in text
+    assert "security notes" not in text

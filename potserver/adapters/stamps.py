@@ -1,0 +1,20 @@
+"""Stamps against our own clock."""
+
+from __future__ import annotations
+
+import time
+
+from potserver.errors import OldStampError
+
+
+def check_not_future(stamp_ns: int, max_future_s: float) -> None:
+    """Refuse a stamp that the clock will not reach soon.
+
+    Raises:
+        OldStampError: it is more than `max_future_s` ahead; the code stands for every stamp out of order.
+    """
+    ahead_s = (stamp_ns - time.time_ns()) / 1e9
+    if ahead_s > max_future_s:
+        raise OldStampError(
+            f"the stamp is {ahead_s:.3f} s ahead of the server's clock, the limit is {max_future_s} s"
+        )
