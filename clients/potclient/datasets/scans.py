@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import re
+from abc import abstractmethod
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import overload
@@ -48,12 +49,12 @@ class Recording(Sequence[RecordedScan]):
     def __init__(self, path: Path) -> None:
         self.path = path
 
-    def __len__(self) -> int:
-        raise NotImplementedError
+    @abstractmethod
+    def __len__(self) -> int: ...
 
+    @abstractmethod
     def read(self, i: int) -> RecordedScan:
         """Scan i, 0 <= i < len(self)."""
-        raise NotImplementedError
 
     @overload
     def __getitem__(self, index: int) -> RecordedScan: ...
