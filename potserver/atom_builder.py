@@ -7,8 +7,6 @@ import dataclasses
 import logging
 from pathlib import Path
 
-import numpy as np
-
 from potclient.datasets import RecordedScan, Recording, open_dataset
 from potclient.errors import DatasetError
 from potclient.holdout import HoldOut, LabelledPoints
@@ -23,12 +21,12 @@ from potserver.services.learning import LearningSettings, choose_diverse, learn_
 
 _OUTDOOR = LearningSettings()
 _INDOOR = LearningSettings(coarse_m=1.0, fine_m=0.4, max_range_m=10.0)
-# name, settings, scans, licence and source, how many atoms are kept
+# name, settings, licence and source, how many atoms are kept
 _BUILTIN = (
-    (bundled.STREET, _OUTDOOR, slice(None), "MIT, small_gicp, Kenji Koide", 10),
-    (bundled.ROOMS, _INDOOR, slice(None), "MIT, la3dm, Robust Field Autonomy Lab", 8),
-    (bundled.STREET_PLAN, _OUTDOOR, slice(None), "MIT, small_gicp, Kenji Koide", 6),
-    (bundled.PLAN, _INDOOR, slice(None), "MIT, la3dm, Robust Field Autonomy Lab", 8),
+    (bundled.STREET, _OUTDOOR, "MIT, small_gicp, Kenji Koide", 10),
+    (bundled.ROOMS, _INDOOR, "MIT, la3dm, Robust Field Autonomy Lab", 8),
+    (bundled.STREET_PLAN, _OUTDOOR, "MIT, small_gicp, Kenji Koide", 6),
+    (bundled.PLAN, _INDOOR, "MIT, la3dm, Robust Field Autonomy Lab", 8),
 )
 
 
@@ -84,9 +82,8 @@ def run(options: argparse.Namespace) -> AtomDictionary:
     atoms: list[Atom] = []
     try:
         if options.builtin:
-            for name, settings, scans, licence, keep in _BUILTIN:
-                recording = bundled.open_bundled(name)[scans]
-                atoms += _learn_recording(recording, name, settings, licence, keep)
+            for name, settings, licence, keep in _BUILTIN:
+                atoms += _learn_recording(bundled.open_bundled(name), name, settings, licence, keep)
         else:
             settings = LearningSettings(
                 n_sectors=options.sectors,
@@ -94,9 +91,8 @@ def run(options: argparse.Namespace) -> AtomDictionary:
                 coarse_m=options.coarse,
                 fine_m=options.fine,
             )
-            for path in options.datasets:
+            for path, name in zip(options.datasets, names, strict=True):
                 recording = open_dataset(path)[: options.scans]
-                name = _name_of(path)
                 atoms += _learn_recording(recording, name, settings, options.licence, options.atoms)
     except (DatasetError, EmptyError, SolverError) as error:
         raise DictionaryError(str(error)) from error
@@ -154,7 +150,7 @@ def to_scan(recorded: RecordedScan, seq: int) -> Scan:
         robot_id="recording",
         seq=seq,
         stamp_ns=recorded.stamp_ns,
-        points=np.ascontiguousarray(recorded.points, np.float32),
+        points=recorded.points,
         is_return=recorded.is_return,
         T_map_sensor=recorded.T_map_sensor,
         is_planar=recorded.is_planar,

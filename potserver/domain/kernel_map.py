@@ -48,9 +48,9 @@ class KernelMap:
         self._threads = threads or default_threads()
         self._index = kernel_index.build_index(
             kernels.hinge_mean,
-            kernels.gamma.astype(np.float64),
-            kernels.weight_mean.astype(np.float64),
-            kernels.weight_var.astype(np.float64),
+            kernels.gamma,
+            kernels.weight_mean,
+            kernels.weight_var,
             activation_cut=observed_activation / 20.0,
         )
 

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potserver.errors import BadPointsError, BadPoseError, EmptyError, ShapeError
+from potserver.numerics.beams import Beams
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
@@ -61,6 +62,11 @@ class Scan:
     def origin(self) -> Float64:
         """(3,) m, map frame: where the beams start."""
         return self.T_map_sensor[:3, 3]
+
+    @property
+    def beams(self) -> Beams:
+        """The beams in a frame at the sensor with the map's axes."""
+        return Beams(self.points.astype(np.float64) @ self.T_map_sensor[:3, :3].T, self.is_return)
 
 
 def check_rigid(transform: Float64, tolerance: float = 1e-3) -> None:
@@ -200,11 +206,6 @@ class Sector:
     hit_points: Float32  # (M, 3) m, sector frame
     free_points: Float32  # (F, 3) m, sector frame
     T_map_sector: Float64  # (4, 4)
-
-    @property
-    def azimuth_width_rad(self) -> float:
-        """Opening angle of the slice."""
-        return self.azimuth_max_rad - self.azimuth_min_rad
 
 
 class SectorMatch(NamedTuple):

@@ -49,7 +49,6 @@ def label_beams(
     Returns:
         Hits first, in beam order; then the free points, in beam order.
     """
-    n = len(beams.ends)
     hit = np.flatnonzero(beams.is_return)
     length = np.linalg.norm(beams.ends, axis=1)
     usable = np.where(beams.is_return, length - gap_m, length)
@@ -59,7 +58,6 @@ def label_beams(
     )
     fraction *= (usable[long_enough] / length[long_enough])[:, None]
     free = (beams.ends[long_enough, None, :] * fraction[..., None]).reshape(-1, 3)
-    assert len(hit) <= n
     return LabelledPoints(
         np.concatenate([beams.ends[hit], free]),
         np.concatenate([np.ones(len(hit), bool), np.zeros(len(free), bool)]),

@@ -364,7 +364,6 @@ def _sinkhorn(x, y, reg, relative, tol, max_iter, kernel, f, g, u, v, t):
     u[:] = np.float32(1)
     v[:] = np.float32(1)
     its = 0
-    best = np.float32(np.inf)
     while True:
         final = levels == 0
         _gibbs(x, columns, f, g, np.float32(1) / level, kernel)

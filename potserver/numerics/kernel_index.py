@@ -24,6 +24,7 @@ from potserver.numerics.threads import parallel_map, spans
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
+Floats = NDArray[np.floating]
 
 _PROBABILITY_BUDGET = 4e-5  # of a probability, for all cut kernels together
 _TAUS = np.logspace(-3, -12, 10)
@@ -95,9 +96,9 @@ def stack_sizes(hinge: Float64, gamma: Float64) -> Float64:
 
 def build_index(
     hinge: Float64,
-    gamma: Float64,
-    weight: Float64,
-    variance: Float64,
+    gamma: Floats,
+    weight: Floats,
+    variance: Floats,
     *,
     activation_cut: float,
     tau: float | None = None,
@@ -226,7 +227,7 @@ class SparseFeatures(NamedTuple):
 
 
 def sparse_features(
-    points: Float64, hinge: Float64, gamma: Float64, *, cut: float, threads: int = 1
+    points: Float64, hinge: Float64, gamma: Floats, *, cut: float, threads: int = 1
 ) -> SparseFeatures:
     """phi of every kernel at every point, where it is at least `cut`.
 

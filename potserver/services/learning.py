@@ -10,7 +10,7 @@ import numpy as np
 from potserver.domain.dictionary import AtomDictionary
 from potserver.domain.types import Atom, Float32, Float64, KernelSet, Scan
 from potserver.errors import EmptyError, SettingsError, SolverError
-from potserver.numerics.beams import Beams, label_beams, limit_range
+from potserver.numerics.beams import label_beams, limit_range
 from potserver.numerics.coupling import Ragged, coupling_costs
 from potserver.numerics.geometry import in_sector, rotation_z, sector_edges, thin, yaw_of
 from potserver.numerics.logistic import fit_dense
@@ -47,8 +47,7 @@ def learn_atoms(
         seed: Of the free samples and of every subsample.
     """
     rng = np.random.default_rng(seed)
-    ends = scan.points.astype(np.float64) @ scan.T_map_sensor[:3, :3].T
-    beams = limit_range(Beams(ends, scan.is_return), settings.min_range_m, settings.max_range_m)
+    beams = limit_range(scan.beams, settings.min_range_m, settings.max_range_m)
     labelled = label_beams(beams, free_per_beam=settings.free_per_beam, gap_m=settings.gap_m, rng=rng)
     heading = yaw_of(scan.T_map_sensor)
     edges = sector_edges(settings.n_sectors)

@@ -53,7 +53,7 @@ class MappingService:
             settings: The `default` profile by default.
             map_id: Name of the map.
             threads: Threads that integrating one scan may use; all processors by default.
-            seed: Of every random choice; the same scans in the same order give the same map.
+            seed: Of every random choice; the same scans in the same order give the same map, up to rounding.
         """
         self.map_id = map_id
         self.dictionary = dictionary if dictionary is not None else AtomDictionary.builtin()
@@ -135,23 +135,19 @@ class MappingService:
             height = np.zeros(4000) if planar else rng.uniform(-1.5, 3.0, 4000)
             points = np.stack([8.0 * np.cos(angle), 6.0 * np.sin(angle), height], axis=1).astype(np.float32)
             for k in range(2):
-                scan = Scan(
-                    robot_id="warm-up", seq=k, stamp_ns=k, points=points, is_return=np.ones(4000, bool),
-                    T_map_sensor=yaw_pose(0.3 * k, 0.0, 0.0), is_planar=planar,
-                )  # fmt: skip
-                scratch.integrate(scan)
+                pose = yaw_pose(0.3 * k, 0.0, 0.0)
+                scratch.integrate(Scan(points=points, T_map_sensor=pose, is_planar=planar))
             scratch.snapshot.occupancy(points)
 
     # --- the steps, in order ---------------------------------------------------------------------------------------------
 
     def _beams(self, scan: Scan, rng: np.random.Generator) -> Beams:
-        """The scan's beams in a frame at the sensor with the map's axes, limited in range and number."""
-        ends = scan.points.astype(np.float64) @ scan.T_map_sensor[:3, :3].T
-        beams = limit_range(Beams(ends, scan.is_return), self.settings.min_range_m, self.settings.max_range_m)
+        """The scan's beams, limited in range and number."""
+        beams = limit_range(scan.beams, self.settings.min_range_m, self.settings.max_range_m)
         n = len(beams.ends)
         if n == 0:
             raise EmptyError(
-                f"none of {len(ends)} beams is longer than {self.settings.min_range_m} m: nothing to learn from"
+                f"none of {len(scan.points)} beams is longer than {self.settings.min_range_m} m: nothing to learn from"
             )
         if n > self.settings.beams_per_scan:
             drawn = np.sort(rng.choice(n, self.settings.beams_per_scan, replace=False))
@@ -227,7 +223,7 @@ class MappingService:
         features = sparse_features(
             labelled.points[rng.random(len(labelled.points)) < 0.25],
             kernels.hinge_mean,
-            kernels.gamma.astype(np.float64),
+            kernels.gamma,
             cut=0.1,
             threads=self._threads,
         )

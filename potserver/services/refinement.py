@@ -58,11 +58,12 @@ def fill_kernels(
     than the coarse ones explain nothing: an atom of a wide street must not keep detail out of a room.
     """
     parts: list[KernelSet] = []
+    fine = is_fine(known, settings)
     if settings.fill_coarse_m:
-        wide = known.take(~is_fine(known, settings) & ~is_too_wide(known, settings))
+        wide = known.take(~fine & ~is_too_wide(known, settings))
         parts.append(_fill(labelled.points, wide, settings.fill_coarse_m, settings, threads))
     if settings.fill_fine_m:
-        narrow = known.take(is_fine(known, settings))
+        narrow = known.take(fine)
         parts.append(
             _fill(labelled.points[labelled.occupied], narrow, settings.fill_fine_m, settings, threads)
         )
@@ -95,9 +96,7 @@ def _fill(
 def activation(kernels: KernelSet, points: Float64, *, threads: int) -> np.ndarray:
     """(N,) sum of phi at each point."""
     zeros = np.zeros(len(kernels))
-    index = build_index(
-        kernels.hinge_mean, kernels.gamma.astype(np.float64), zeros, zeros, activation_cut=0.01, tau=1.0
-    )
+    index = build_index(kernels.hinge_mean, kernels.gamma, zeros, zeros, activation_cut=0.01, tau=1.0)
     return latent_sums(index, points, threads=threads).activation
 
 
@@ -125,7 +124,7 @@ def refine(
     features = sparse_features(
         labelled.points,
         kernels.hinge_mean,
-        kernels.gamma.astype(np.float64),
+        kernels.gamma,
         cut=feature_cut,
         threads=threads,
     )
