@@ -12,8 +12,9 @@ import select
 import signal
 import sys
 from collections.abc import Iterator, Sequence
+from pathlib import Path
 from types import FrameType
-from typing import Any, TextIO
+from typing import TYPE_CHECKING, Any, TextIO
 
 import zenoh
 
@@ -21,6 +22,9 @@ from potschemas import __version__
 from potserver.adapters.log import configure_logging, get_logger
 from potserver.config import Settings, as_tree, load_settings, to_toml
 from potserver.errors import PotserverError, SettingsError
+
+if TYPE_CHECKING:
+    from potserver.domain.dictionary import AtomDictionary
 
 log = get_logger("potserver.cli")
 
@@ -59,11 +63,33 @@ Print the effective settings, after file, variables and flags, as a TOML file th
 A variable names its key with double underscores: POTSERVER_LIMITS__MAX_CLOUD_BYTES=1000000."""
 
 _ATOMS_INFO = """\
-List the atoms of a dictionary: the learned pieces of scans that are carried to each new cloud."""
+List the atoms of a dictionary: the learned pieces of scans that are carried to each new cloud.
+
+The scores are those of beams that were held out while learning, where the builder noted them. --picture
+draws each atom's points, its kernels, and what they predict, with the uncertainty."""
+
+_ATOMS_EXPORT = """\
+Take atoms out of a dictionary, one *.atom file each: the form in which `potclient atoms add` sends them to
+a server."""
+
+_ATOMS_IMPORT = """\
+Put *.atom files into a dictionary file. Each is judged as a server would judge it; if one is refused,
+nothing changes."""
 
 
 _ATOMS_BUILD = """\
-Learn atoms from recordings, keep those that differ most, score them on beams they never saw, and write a dictionary."""
+Learn a dictionary: atoms of all sectors of the recordings' scans, scored on beams that they never saw; of the good
+ones so many are kept that each of the others has a kept atom within the tolerance.
+
+The same recipe gives the same file, however many workers there are, on one machine with the same versions."""
+
+_ATOMS_BUILD_EXAMPLES = """\
+examples:
+  potserver atoms build /data/kitti/00 --scans 0:1000:10 --licence "CC BY-NC-SA 3.0" -o kitti.atoms
+  potserver atoms build town:terraces:1 town:suburb:2 --learner n_sectors=8 -o towns.atoms
+  potserver atoms build --recipe site.toml -o site.atoms      a recipe: see the README
+  potserver atoms build --recipe site.toml -o site.atoms --ray auto
+                                                              on a Ray cluster, with recordings at the same paths"""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -71,7 +97,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = list(sys.argv[1:] if argv is None else argv)
     if arguments[:1] == ["demo"]:  # it has a parser of its own
         return _demo(arguments[1:])
-    parser = _parser(building=arguments[:2] == ["atoms", "build"])
+    parser = _parser()
     options = parser.parse_args(arguments)
     if not hasattr(options, "run"):
         parser.print_help()
@@ -137,24 +163,101 @@ def _atoms_info(options: argparse.Namespace) -> int:
     if options.json:
         _say(json.dumps(rows, indent=2))
         return EXIT_OK
-    columns = ("atom_id", "dims", "n_hits", "n_free", "n_kernels", "radius_m")
-    table = [columns, *(tuple(_cell(row[column]) for column in columns) for row in rows)]
-    widths = [max(len(line[i]) for line in table) for i in range(len(columns))]
+    drawn = _draw_atoms(dictionary, options, title=str(path or "built-in atoms")) if options.picture else ""
+    heads = ("atom", "dims", "hits", "free", "kernels", "AUC", "NLL", "ECE", *_TEXTS)
+    table = [heads, *(_atom_cells(row) for row in rows)]
+    widths = [max(len(line[i]) for line in table) for i in range(len(heads))]
     for line in table:
-        cells = [
-            line[0].ljust(widths[0]),
-            *(cell.rjust(w) for cell, w in zip(line[1:], widths[1:], strict=True)),
-        ]
-        _say("  ".join(cells))
+        numbers = (cell.rjust(w) for cell, w in zip(line[1:-5], widths[1:-5], strict=True))
+        texts = (cell.ljust(w) for cell, w in zip(line[-5:], widths[-5:], strict=True))
+        _say("  ".join([line[0].ljust(widths[0]), *numbers, *texts]).rstrip())
     _say(f"{len(rows)} atoms, {sum(len(a.kernels) for a in dictionary)} kernels, {path or 'built in'}")
+    if drawn:
+        _say(drawn)
+    return EXIT_OK
+
+
+_TEXTS = ("source", "scan", "sector", "learner", "licence")
+
+
+def _atom_cells(row: dict[str, Any]) -> tuple[str, ...]:
+    noted: dict[str, str] = row["provenance"]
+    counts = [str(row[name]) for name in ("dims", "n_hits", "n_free", "n_kernels")]
+    scores = [noted.get(f"held_out_{name}", "-") for name in ("auc", "nll", "ece")]
+    texts = [noted.get(name, "-") for name in _TEXTS]
+    return (
+        row["atom_id"],
+        *counts,
+        *scores,
+        *(text if len(text) <= 24 else f"{text[:23]}…" for text in texts),
+    )
+
+
+def _draw_atoms(dictionary: AtomDictionary, options: argparse.Namespace, *, title: str) -> str:
+    """Draw the picture; what to say of it."""
+    from potserver.atom_sheet import choose, draw_sheet  # matplotlib takes a second to load
+
+    atoms = choose(dictionary, options.atom, options.limit)
+    try:
+        draw_sheet(atoms, options.picture, title=f"{title}: {len(atoms)} of {len(dictionary)} atoms")
+    except OSError as error:
+        raise SettingsError(f"cannot write {options.picture}: {error.strerror or error}") from error
+    hint = "" if options.atom or len(atoms) == len(dictionary) else " (--atom ID or --limit N choose others)"
+    return f"{len(atoms)} atoms drawn to {options.picture}{hint}"
+
+
+def _atoms_export(options: argparse.Namespace) -> int:
+    from potserver.adapters import codec
+    from potserver.domain.dictionary import AtomDictionary
+    from potserver.domain.types import AnswerRule
+
+    settings = _settings(options)
+    dictionary = AtomDictionary.load(settings.dictionary) if settings.dictionary else AtomDictionary.builtin()
+    atoms = [dictionary.get(atom_id) for atom_id in options.atom_id] or list(dictionary)
+    m = settings.mapping
+    rule = AnswerRule(m.observed_activation, m.prior_var, m.residual_var, m.mean_moderation)
+    folder = Path(options.out)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for atom in atoms:
+            (folder / f"{atom.atom_id}.atom").write_bytes(codec.encode_atom(atom, {}, rule).payload)
+    except OSError as error:
+        raise SettingsError(f"cannot write to {folder}: {error.strerror or error}") from error
+    _say(f"{len(atoms)} atoms written to {folder}")
+    return EXIT_OK
+
+
+def _atoms_import(options: argparse.Namespace) -> int:
+    from potserver.adapters import codec
+    from potserver.domain.dictionary import AtomDictionary
+    from potserver.services.admission import admit
+
+    settings = _settings(options)
+    out = Path(options.out)
+    dictionary = AtomDictionary.load(out) if out.exists() else AtomDictionary()
+    for name in options.file:
+        try:
+            atom = codec.read_atom_file(Path(name).read_bytes())
+            admit(atom, dictionary, settings.atoms.admission)
+        except OSError as error:
+            raise SettingsError(f"cannot read {name}: {error.strerror or error}") from error
+        except PotserverError as error:
+            raise SettingsError(f"{name}: {error}") from error
+        dictionary = dictionary.add(atom)
+    dictionary.save(out)
+    _say(f"{len(options.file)} atoms added, {len(dictionary)} in {out}")
     return EXIT_OK
 
 
 def _atoms_build(options: argparse.Namespace) -> int:
-    from potserver import atom_builder
+    from potserver.atom_builder import command  # this loads the numerics
 
-    configure_logging("info", "auto")
-    dictionary = atom_builder.run(options)
+    configure_logging("warning", "console")
+    try:
+        dictionary = command.run(options)
+    except KeyboardInterrupt:
+        _say("potserver: interrupted, nothing was written", sys.stderr)
+        return EXIT_FORCED
     n_kernels = sum(len(atom.kernels) for atom in dictionary)
     _say(f"{len(dictionary)} atoms, {n_kernels} kernels, written to {options.out}")
     return EXIT_OK
@@ -219,7 +322,7 @@ class _Formatter(argparse.RawDescriptionHelpFormatter):
         super().__init__(prog, max_help_position=34, width=110)
 
 
-def _parser(*, building: bool) -> argparse.ArgumentParser:
+def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="potserver",
         description=_ABOUT,
@@ -255,25 +358,89 @@ def _parser(*, building: bool) -> argparse.ArgumentParser:
     )
     info.add_argument("file", nargs="?", help="a dictionary file; default: the one that the settings name")
     info.add_argument("--json", action="store_true", help="everything, with provenance")
+    info.add_argument("--picture", metavar="PNG", help="draw atoms to this file")
+    info.add_argument("--atom", action="append", default=[], metavar="ID", help="draw this one; repeatable")
+    info.add_argument(
+        "--limit", type=int, default=8, metavar="N", help="draw N at most, spread over the dictionary [8]"
+    )
     _add_settings_flags(info)
     info.set_defaults(run=_atoms_info)
+
+    export = atoms_commands.add_parser(
+        "export", help="write atoms as single files", description=_ATOMS_EXPORT, formatter_class=_Formatter
+    )
+    export.add_argument("atom_id", nargs="*", metavar="ID", help="which ones [all]")
+    export.add_argument("-o", "--out", required=True, metavar="FOLDER", help="where the *.atom files go")
+    _add_settings_flags(export)
+    export.set_defaults(run=_atoms_export)
+
+    import_ = atoms_commands.add_parser(
+        "import",
+        help="put single files into a dictionary",
+        description=_ATOMS_IMPORT,
+        formatter_class=_Formatter,
+    )
+    import_.add_argument("file", nargs="+", metavar="FILE", help="*.atom files")
+    import_.add_argument(
+        "-o", "--out", required=True, metavar="FILE", help="the dictionary; made if there is none"
+    )
+    _add_settings_flags(import_)
+    import_.set_defaults(run=_atoms_import)
 
     build = atoms_commands.add_parser(
         "build",
         help="learn a dictionary from recordings",
         description=_ATOMS_BUILD,
+        epilog=_ATOMS_BUILD_EXAMPLES,
         formatter_class=_Formatter,
     )
-    if building:  # its flags come with the learner, which no other command needs
-        from potserver import atom_builder
-
-        atom_builder.add_arguments(build)
+    _add_build_flags(build)
     build.set_defaults(run=_atoms_build)
 
     commands.add_parser(
         "demo", help="map recorded scans through a real server, and score the maps", add_help=False
     )
     return parser
+
+
+def _add_build_flags(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("datasets", nargs="*", metavar="DATASET", help="recordings to learn from")
+    parser.add_argument("-o", "--out", required=True, metavar="FILE", help="dictionary file to write")
+    parser.add_argument("--recipe", metavar="FILE", help="TOML file that says what to learn from, and how")
+    parser.add_argument(
+        "--builtin", action="store_true", help="the recipe of the dictionary that the package ships"
+    )
+    parser.add_argument("--strict", action="store_true", help="end at the first scan that fails")
+    running = parser.add_argument_group("where it runs")
+    running.add_argument(
+        "--watch",
+        action="store_true",
+        help="in this process, with each sector's held-out scores as it learns",
+    )
+    running.add_argument("--workers", type=int, metavar="N", help="scans learned at once [all processors]")
+    running.add_argument(
+        "--ray", metavar="ADDRESS", help="on a Ray cluster; `local` starts one here (needs potserver[ray])"
+    )
+    without = parser.add_argument_group("without a recipe")
+    without.add_argument(
+        "--scans", metavar="N", help="the first N of each recording, or START:STOP:STEP [all]"
+    )
+    without.add_argument(
+        "--tolerance", type=float, metavar="M", help="of the cover, m [0.15 of the atoms' radius]"
+    )
+    without.add_argument(
+        "--max-atoms", type=int, metavar="N", help="kept in each number of dimensions [no limit]"
+    )
+    without.add_argument(
+        "--licence", metavar="TEXT", help="of the recordings, kept with the atoms [not stated]"
+    )
+    without.add_argument(
+        "--learner",
+        action="append",
+        default=[],
+        metavar="KEY=VALUE",
+        help="a setting of the learner; repeatable",
+    )
 
 
 def _add_settings_flags(parser: argparse.ArgumentParser) -> None:
@@ -369,10 +536,6 @@ def _split(assignment: str, separator: str, flag: str, form: str) -> tuple[str, 
 
 def _say(text: str, stream: TextIO | None = None) -> None:
     (stream or sys.stdout).write(f"{text}\n")
-
-
-def _cell(value: Any) -> str:
-    return f"{value:.1f}" if isinstance(value, float) else str(value)
 
 
 if __name__ == "__main__":

@@ -27,6 +27,7 @@ from potschemas import keys
 from potserver.adapters.limits import Limits
 from potserver.adapters.session import ZenohSettings
 from potserver.errors import SettingsError
+from potserver.services.admission import AdmissionSettings
 from potserver.services.settings import MappingSettings
 
 tomllib: Any = importlib.import_module("tomllib" if sys.version_info >= (3, 11) else "tomli")
@@ -70,6 +71,15 @@ class PoseSettings:
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class AtomSettings:
+    """Changes of the atom dictionary over `q/atoms`."""
+
+    writable: bool = True  # whoever reaches the server may change it, as they may send clouds and clear maps
+    save: bool = False  # write each change to the file `dictionary` before it is acknowledged; else a restart forgets it
+    admission: AdmissionSettings = dataclasses.field(default_factory=AdmissionSettings)
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class LogSettings:
     """What goes to stderr."""
 
@@ -94,6 +104,7 @@ class Settings:
     intake: IntakeSettings = dataclasses.field(default_factory=IntakeSettings)
     queries: QuerySettings = dataclasses.field(default_factory=QuerySettings)
     poses: PoseSettings = dataclasses.field(default_factory=PoseSettings)
+    atoms: AtomSettings = dataclasses.field(default_factory=AtomSettings)
     log: LogSettings = dataclasses.field(default_factory=LogSettings)
     # `mapping.profile` sets what the other keys of the table start from
     mapping: MappingSettings = dataclasses.field(default_factory=MappingSettings)
@@ -305,6 +316,11 @@ def _check(s: Settings) -> None:
     need("stats_period_s", 0.01 <= s.stats_period_s < math.inf, "at least 0.01 s")
     need("drain_timeout_s", 0 <= s.drain_timeout_s < math.inf, "a number of seconds")
     need("zenoh.mode", s.zenoh.mode in (None, "peer", "client", "router"), "peer, client or router")
+    need(
+        "atoms.save",
+        not s.atoms.save or s.dictionary is not None,
+        "the setting `dictionary` beside it: the built-in atoms belong to the program",
+    )
     need("log.level", s.log.level in ("debug", "info", "warning", "error"), "debug, info, warning or error")
     need("log.format", s.log.format in ("auto", "json", "console"), "auto, json or console")
     need(

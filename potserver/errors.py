@@ -9,9 +9,12 @@ class PotserverError(Exception):
     code: str = "internal"
     retryable: bool = False
 
-    def __init__(self, message: str, *, retry_after_s: float | None = None) -> None:
+    def __init__(
+        self, message: str, *, retry_after_s: float | None = None, reason: str | None = None
+    ) -> None:
         super().__init__(message)
         self.retry_after_s = retry_after_s
+        self.reason = reason  # finer than the code, where one code has several
 
 
 class BadMessageError(PotserverError):
@@ -78,6 +81,18 @@ class UnknownAtomError(PotserverError):
     """No atom of this id in the dictionary."""
 
     code = "unknown_atom"
+
+
+class AtomRefusedError(PotserverError):
+    """The atom may not join the dictionary; `reason` says which rule it breaks."""
+
+    code = "atom_refused"
+
+
+class ReadOnlyError(PotserverError):
+    """The server takes no changes of its dictionary."""
+
+    code = "read_only"
 
 
 class UnsupportedError(PotserverError):

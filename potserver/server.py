@@ -17,6 +17,7 @@ import dataclasses
 import threading
 import time
 from collections.abc import Callable
+from pathlib import Path
 from types import TracebackType
 from typing import Protocol
 
@@ -41,6 +42,8 @@ from potserver.adapters.writer import MapWriter
 from potserver.config import Settings, as_tree
 from potserver.domain.dictionary import AtomDictionary
 from potserver.errors import ShuttingDownError
+from potserver.numerics.threads import default_threads
+from potserver.services.atom_store import AtomStore
 from potserver.services.health import Health, rss_bytes
 from potserver.services.mapping import MappingService
 from potserver.services.query import QueryService
@@ -112,7 +115,9 @@ class MapServer:
             atexit.register(self.stop)  # leaving with Zenoh open would abort the process
             try:
                 started_s = time.perf_counter()
-                next(iter(services.values()))[0].warm_up()  # all maps share the compiled numerics
+                mapper, asker = next(iter(services.values()))  # all maps share the compiled numerics
+                mapper.warm_up()
+                asker.warm_up()
                 log.info("server_warmed_up", elapsed_ms=round((time.perf_counter() - started_s) * 1e3, 1))
                 self._pool = QueryPool(
                     threads=s.queries.threads,
@@ -120,11 +125,13 @@ class MapServer:
                     max_queued_bytes=s.queries.max_queued_bytes,
                     retry_after_s=s.queries.retry_after_s,
                 )
+                atoms = _atom_store([mapper for mapper, _ in services.values()], s)
                 for map_id, (mapper, asker) in services.items():
                     self._nodes[map_id] = _MapNode(
                         map_id,
                         mapper,
                         asker,
+                        atoms,
                         session=self._session,
                         pool=self._pool,
                         health=self.health,
@@ -244,6 +251,7 @@ class _MapNode:
         map_id: str,
         mapper: Mapper,
         asker: Asker,
+        atoms: AtomStore,
         *,
         session: zenoh.Session,
         pool: QueryPool,
@@ -330,6 +338,7 @@ class _MapNode:
                 self._keys,
                 mapper=mapper,
                 asker=asker,
+                atoms=atoms,
                 intake=self.intake,
                 receipts=self._receipts,
                 pool=pool,
@@ -424,6 +433,24 @@ class _StatsPublisher:
                 log.exception("stats_failed")
 
 
+def _atom_store(mappers: list[Mapper], settings: Settings) -> AtomStore:
+    """One for all maps of the server, whose dictionary is the same."""
+
+    def use(dictionary: AtomDictionary) -> None:
+        for mapper in mappers:
+            mapper.use_dictionary(dictionary)
+
+    is_saved = settings.atoms.save and settings.dictionary is not None
+    return AtomStore(
+        mappers[0].dictionary,
+        use,
+        settings=settings.atoms.admission,
+        writable=settings.atoms.writable,
+        file=Path(str(settings.dictionary)) if is_saved else None,
+        threads=settings.threads or default_threads(),
+    )
+
+
 def _default_maps(settings: Settings) -> MakeMap:
     dictionary: list[AtomDictionary] = []  # loaded once, when the first map is made
 
@@ -441,6 +468,10 @@ def _default_maps(settings: Settings) -> MakeMap:
             mapping,
             max_points=settings.limits.max_query_points,
             max_grid_cells=settings.limits.max_grid_cells,
+            max_samples=settings.limits.max_query_samples,
+            max_rays=settings.limits.max_query_rays,
+            max_poses=settings.limits.max_query_poses,
+            max_spheres=settings.limits.max_query_spheres,
             max_coordinate_m=settings.limits.max_coordinate_m,
         )
         return mapping, asker

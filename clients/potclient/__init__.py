@@ -7,8 +7,10 @@ with MapClient("tcp/127.0.0.1:7447", map="default") as client:
     receipt.kernels.occupancy(queries)  # the same formulas offline, on the kernels that came back
 """
 
+from potclient.atoms import Atom
 from potclient.client import MapClient, Subscription
 from potclient.errors import (
+    AtomRefusedError,
     BadMessageError,
     BadPointsError,
     BadPoseError,
@@ -28,6 +30,7 @@ from potclient.errors import (
     OverloadedError,
     PotclientError,
     QueryTimeoutError,
+    ReadOnlyError,
     ShapeError,
     ShuttingDownError,
     TooLargeError,
@@ -37,12 +40,13 @@ from potclient.errors import (
     UsageError,
 )
 from potclient.kernels import KernelSet
-from potclient.results import Atom, FeedCounts, Grid, Occupancy, Receipt, TransportedParams
+from potclient.results import FeedCounts, Grid, Occupancy, Rays, Receipt, Risk, TransportedParams
 from potclient.session import SessionOptions
 from potschemas import __version__
 
 __all__ = [
     "Atom",
+    "AtomRefusedError",
     "BadMessageError",
     "BadPointsError",
     "BadPoseError",
@@ -67,7 +71,10 @@ __all__ = [
     "OverloadedError",
     "PotclientError",
     "QueryTimeoutError",
+    "Rays",
+    "ReadOnlyError",
     "Receipt",
+    "Risk",
     "SessionOptions",
     "ShapeError",
     "ShuttingDownError",

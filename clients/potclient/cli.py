@@ -1,4 +1,4 @@
-"""`potclient publish | query | grid | watch | load | info | atoms | control`."""
+"""`potclient publish | query | grid | rays | risk | export | watch | load | info | atoms | control | town`."""
 
 from __future__ import annotations
 
@@ -16,12 +16,13 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 import numpy as np
 
+from potclient.atoms import Atom
 from potclient.client import MapClient
 from potclient.datasets import FORMATS, FRAMES, Recording, open_dataset
 from potclient.errors import DatasetError, MapServerError, PotclientError, UsageError
 from potclient.holdout import HoldOut
 from potclient.session import DEFAULT_ENDPOINT, add_zenoh_arguments, options_from_arguments
-from potschemas import __version__
+from potschemas import __version__, messages
 from potschemas.keys import DEFAULT_ROOT
 
 if TYPE_CHECKING:
@@ -63,6 +64,8 @@ def build_parser() -> argparse.ArgumentParser:
   potclient publish generated                     play a made-up scene into the map
   potclient query 1 2 0.5                         how likely is this point occupied, and how sure is the map
   potclient grid --resolution 0.2 -o map.npz      the whole map as a grid
+  potclient rays 0 0 1 --max-range 20             how far one can see from there, all around
+  potclient export bt -o map.bt --resolution 0.2  the map for programs that read OctoMap files
   potclient load --robots 8 --planners 4          how much the server takes
 
 `potclient COMMAND --help` explains each command.""",
@@ -73,11 +76,15 @@ def build_parser() -> argparse.ArgumentParser:
     _add_publish(commands)
     _add_query(commands)
     _add_grid(commands)
+    _add_rays(commands)
+    _add_risk(commands)
+    _add_export(commands)
     _add_watch(commands)
     _add_load(commands)
     _add_info(commands)
     _add_atoms(commands)
     _add_control(commands)
+    _add_town(commands)
     return parser
 
 
@@ -97,9 +104,11 @@ DATASET is found out by looking at it:
   a folder with velodyne/*.bin      KITTI odometry, with poses.txt and calib.txt
   a folder of .pcd or .ply files    with poses.txt (3x4 a line), or a VIEWPOINT in each header
   a .log or .clf file (.bz2, .gz)   a CARMEN log of a planar laser
-  generated[:2d][:SEED]             a made-up scene""",
+  generated[:2d][:SEED]             a made-up yard
+  town:STYLE[:2d][:dynamic][:SEED]  a drive through a made-up town, see `potclient town --help`""",
         epilog="""examples:
   potclient publish generated --limit 20
+  potclient publish town:terraces:300m --every 5 --max-range 25 --hold-out 0.2
   potclient publish kitti/00 --poses poses_velo_icp.txt --max-range 25
   potclient publish sim_structured --max-range 8 --hold-out 0.2
   potclient publish aces.clf.bz2 --poses aces_poses_optimised.txt --every 10 --rate 20
@@ -232,14 +241,14 @@ def _scan_progress(total: int, *, quiet: bool) -> Iterator[Callable[[ScanOutcome
         yield show
 
 
-def _rich_progress(total: int) -> tuple[Any, Any] | None:
+def _rich_progress(total: int, what: str = "scans") -> tuple[Any, Any] | None:
     try:
         from rich.console import Console
         from rich.progress import Progress
     except ImportError:
         return None
     bar = Progress(console=Console(stderr=True), transient=True)
-    return bar, bar.add_task("scans", total=total)
+    return bar, bar.add_task(what, total=total)
 
 
 # --- query and grid ------------------------------------------------------------------------------------------------
@@ -257,12 +266,14 @@ log-odds with theirs, and whether the map has seen anything near: unknown is 0.5
   potclient query 1 2 0.5
   potclient query 1 2 0.5 -3 0 1           two points
   potclient query --file points.npy -o answers.npz
+  potclient query 1 2 0.5 --gradient       which way it gets more likely occupied
   potclient query 1 2 0.5 --json -""",
     )
     parser.add_argument("coordinates", type=float, nargs="*", metavar="X Y Z", help="metres, map frame")
     parser.add_argument(
         "--file", type=Path, metavar="FILE", help=".npy of shape (N, 3) or (N, 2), or text rows of x y z"
     )
+    parser.add_argument("--gradient", action="store_true", help="gradients of probability and log-odds too")
     parser.add_argument("-o", "--out", type=Path, metavar="FILE", help="write all answers to an .npz")
     _add_json_argument(parser)
 
@@ -270,29 +281,24 @@ log-odds with theirs, and whether the map has seen anything near: unknown is 0.5
 def _query(arguments: argparse.Namespace) -> int:
     points = _query_points(arguments)
     with _client(arguments) as client:
-        answer = client.occupancy(points)
+        answer = client.occupancy(points, with_gradient=arguments.gradient)
+    names = ["mean", "var", "latent_mean", "latent_var", "observed"]
+    names += ["gradient", "latent_gradient"] if arguments.gradient else []
     if arguments.out is not None:
         with arguments.out.open("wb") as file:
             np.savez_compressed(
                 file,
                 allow_pickle=False,
                 points=points,
-                mean=answer.mean,
-                var=answer.var,
-                latent_mean=answer.latent_mean,
-                latent_var=answer.latent_var,
-                observed=answer.observed,
                 revision=np.int64(answer.revision),
+                **{name: getattr(answer, name) for name in names},
             )
     _write_json(
         arguments.json,
         {
             "revision": answer.revision,
             "points": points.tolist(),
-            **{
-                n: getattr(answer, n).tolist()
-                for n in ("mean", "var", "latent_mean", "latent_var", "observed")
-            },
+            **{name: getattr(answer, name).tolist() for name in names},
         },
     )
     if arguments.json == "-":
@@ -306,11 +312,13 @@ def _query(arguments: argparse.Namespace) -> int:
             f"{answer.latent_mean[i]:+.3f}",
             f"{math.sqrt(answer.latent_var[i]):.3f}",
             "yes" if answer.observed[i] else "no",
+            *([] if answer.gradient is None else [f"{g:+.4f}" for g in answer.gradient[i]]),
         ]
         for i in range(min(len(points), shown))
     ]
-    heads = ["x", "y", "z"][: points.shape[1]]
-    _say(_table([*heads, "P(occupied)", "std", "log-odds", "std", "observed"], rows))
+    heads = [*["x", "y", "z"][: points.shape[1]], "P(occupied)", "std", "log-odds", "std", "observed"]
+    heads += ["dP/dx 1/m", "dP/dy", "dP/dz"] if arguments.gradient else []
+    _say(_table(heads, rows))
     if len(points) > shown:
         _say(f"... and {len(points) - shown} more (-o FILE or --json FILE has all)")
     _say(
@@ -326,17 +334,20 @@ def _query_points(arguments: argparse.Namespace) -> np.ndarray[Any, np.dtype[np.
         if len(arguments.coordinates) % 3:
             raise UsageError(f"query: {len(arguments.coordinates)} coordinates are not whole points of X Y Z")
         return np.asarray(arguments.coordinates, np.float64).reshape(-1, 3)
+    return _read_table(arguments.file, (2, 3), "points")
+
+
+def _read_table(path: Path, columns: tuple[int, ...], what: str) -> np.ndarray[Any, np.dtype[np.float64]]:
+    """Rows of numbers, from an .npy or from text."""
     try:
-        if arguments.file.suffix == ".npy":
-            points = np.load(arguments.file, allow_pickle=False)
-        else:
-            points = np.loadtxt(arguments.file, ndmin=2)
-        points = np.asarray(points, np.float64)
+        table = np.load(path, allow_pickle=False) if path.suffix == ".npy" else np.loadtxt(path, ndmin=2)
+        table = np.asarray(table, np.float64)
     except (ValueError, TypeError, EOFError) as error:
-        raise UsageError(f"{arguments.file}: not an array of points ({error})") from error
-    if points.ndim != 2 or points.shape[1] not in (2, 3) or not len(points):
-        raise UsageError(f"{arguments.file}: shape {points.shape}, need (N, 3) or (N, 2)")
-    return points
+        raise UsageError(f"{path}: not an array of {what} ({error})") from error
+    if table.ndim != 2 or table.shape[1] not in columns or not len(table):
+        need = " or ".join(f"(N, {n})" for n in reversed(columns))
+        raise UsageError(f"{path}: shape {table.shape}, need {need}")
+    return table
 
 
 def _add_grid(commands: Any) -> None:
@@ -409,6 +420,350 @@ def _part_progress() -> Callable[[int, int], None] | None:
         sys.stderr.flush()
 
     return show
+
+
+# --- rays and risk -------------------------------------------------------------------------------------------------
+
+
+def _add_rays(commands: Any) -> None:
+    parser = _command(
+        commands,
+        "rays",
+        _rays,
+        help="how far rays get: expected range, quantiles, where the map does not know",
+        description="""Ask where rays from a point first return. Without --toward or --file, rays go all around in the plane.
+
+The hazard of a return along a ray is -ln(1 - P) / width, with P the probability of occupancy: a stretch of one width with
+constant P stops the ray with probability P. Ranges are of the first return, or the maximum range where none is before.""",
+        epilog="""examples:
+  potclient rays 0 0 1 --max-range 20
+  potclient rays 0 0 1 --toward 1 0 0 --quantiles 0.05 0.5 0.95
+  potclient rays --file rays.npy --max-range 30 --unknown free -o answers.npz""",
+    )
+    parser.add_argument("origin", type=float, nargs="*", metavar="X Y Z", help="metres, map frame")
+    which = parser.add_mutually_exclusive_group()
+    which.add_argument(
+        "--toward", type=float, nargs=3, metavar=("DX", "DY", "DZ"), help="one ray, along this direction"
+    )
+    which.add_argument("--fan", type=int, default=16, metavar="N", help="rays all around (default 16)")
+    which.add_argument(
+        "--file", type=Path, metavar="FILE", help=".npy of shape (N, 6): origins and directions; or text rows"
+    )
+    parser.add_argument(
+        "--max-range", type=_positive, default=25.0, metavar="METRES", help="of the rays (default 25)"
+    )
+    parser.add_argument(
+        "--quantiles", type=float, nargs="+", default=[0.05, 0.5, 0.95], metavar="Q", help="ascending"
+    )
+    _add_unknown_argument(parser, "prior")
+    parser.add_argument(
+        "--width", type=_positive, metavar="METRES", help="over which P is one trial (default: the kernels')"
+    )
+    parser.add_argument("--step", type=_positive, metavar="METRES", help="of the summation (default: fine)")
+    parser.add_argument("-o", "--out", type=Path, metavar="FILE", help="write all answers to an .npz")
+    _add_json_argument(parser)
+
+
+def _rays(arguments: argparse.Namespace) -> int:
+    origins, directions = _ray_arguments(arguments)
+    with _client(arguments) as client:
+        answer = client.rays(
+            origins,
+            directions,
+            arguments.max_range,
+            quantiles=arguments.quantiles,
+            unknown=arguments.unknown,
+            width_m=arguments.width,
+            step_m=arguments.step,
+        )
+    arrays = {
+        name: getattr(answer, name)
+        for name in (
+            "hit_probability",
+            "mean_m",
+            "std_m",
+            "quantile_m",
+            "unknown_range_m",
+            "unknown_share",
+        )
+    }
+    if arguments.out is not None:
+        with arguments.out.open("wb") as file:
+            np.savez_compressed(
+                file,
+                allow_pickle=False,
+                origins=origins,
+                directions=directions,
+                quantiles=np.asarray(answer.quantiles),
+                revision=np.int64(answer.revision),
+                **arrays,
+            )
+    _write_json(
+        arguments.json,
+        {
+            "revision": answer.revision,
+            "step_m": answer.step_m,
+            "quantiles": answer.quantiles,
+            "directions": directions.tolist(),
+            **{name: array.tolist() for name, array in arrays.items()},
+        },
+    )
+    if arguments.json == "-":
+        return EXIT_OK
+    shown = 40
+    rows = [
+        [
+            *[f"{c:+.3f}" for c in directions[i]],
+            f"{answer.hit_probability[i]:.4f}",
+            f"{answer.mean_m[i]:.3f}",
+            f"{answer.std_m[i]:.3f}",
+            *[f"{q:.3f}" for q in answer.quantile_m[i]],
+            "-" if math.isnan(answer.unknown_range_m[i]) else f"{answer.unknown_range_m[i]:.3f}",
+            f"{answer.unknown_share[i]:.1%}",
+        ]
+        for i in range(min(len(answer), shown))
+    ]
+    heads = ["dx", "dy", "dz", "P(return)", "mean m", "std m", *[f"q{q:g} m" for q in answer.quantiles]]
+    _say(_table([*heads, "unknown from m", "unknown"], rows))
+    if len(answer) > shown:
+        _say(f"... and {len(answer) - shown} more (-o FILE or --json FILE has all)")
+    _say(f"map revision {answer.revision}, steps of {answer.step_m:.3g} m")
+    return EXIT_OK
+
+
+def _ray_arguments(
+    arguments: argparse.Namespace,
+) -> tuple[np.ndarray[Any, np.dtype[np.float64]], np.ndarray[Any, np.dtype[np.float64]]]:
+    """Origins and directions, (N, 3) each."""
+    if (arguments.file is None) == (not arguments.origin):
+        raise UsageError("rays: give the origin X Y Z, or --file, and not both")
+    if arguments.file is not None:
+        table = _read_table(arguments.file, (6,), "rays, as rows of origin and direction")
+        return table[:, :3], table[:, 3:]
+    if len(arguments.origin) != 3:
+        raise UsageError(f"rays: the origin has {len(arguments.origin)} coordinates, need X Y Z")
+    if arguments.toward is not None:
+        directions = np.asarray([arguments.toward], np.float64)
+    elif arguments.fan < 1:
+        raise UsageError(f"rays: --fan {arguments.fan}, need at least 1")
+    else:
+        azimuth = np.arange(arguments.fan) * (2.0 * math.pi / arguments.fan)
+        directions = np.stack([np.cos(azimuth), np.sin(azimuth), np.zeros(arguments.fan)], axis=1)
+    return np.tile(np.asarray(arguments.origin, np.float64), (len(directions), 1)), directions
+
+
+def _add_risk(commands: Any) -> None:
+    parser = _command(
+        commands,
+        "risk",
+        _risk,
+        help="how likely a robot on a path touches something",
+        description="""Ask how likely a robot made of spheres touches an occupied point, pose by pose and for the whole path.
+
+The robot covers cells of a lattice: all whose centres lie in a sphere, and those of the spheres' own centres. "max" is the
+likeliest of them, as if all were one trial; "union" takes cells further apart than the correlation length as independent. The
+truth lies between "max" and the sum over all cells. Poses count as they are: nothing is covered between them.
+
+The path is a text file with, in each row, x y z, or x y z yaw (radians), or the 12 numbers of a 3x4 matrix, row by row.""",
+        epilog="""examples:
+  potclient risk --path path.txt --sphere 0 0 0.3 0.35
+  potclient risk --path poses.txt --sphere 0.3 0 0.4 0.4 --sphere -0.3 0 0.4 0.4 --unknown prior
+  potclient risk --path path.txt --sphere 0 0 0 0.3 --2d --json risk.json""",
+    )
+    parser.add_argument("--path", type=Path, required=True, metavar="FILE", help="poses; .npy, or text rows")
+    parser.add_argument(
+        "--sphere",
+        type=float,
+        nargs=4,
+        action="append",
+        required=True,
+        metavar=("X", "Y", "Z", "R"),
+        help="centre in the body frame and radius, m; may be repeated",
+    )
+    _add_unknown_argument(parser, "occupied")
+    parser.add_argument(
+        "--resolution", type=_positive, metavar="METRES", help="cell edge (default: half the smallest radius)"
+    )
+    parser.add_argument(
+        "--correlation", type=_positive, metavar="METRES", help="edge of a cube that is one trial"
+    )
+    parser.add_argument("--2d", action="store_true", dest="planar", help="discs in the plane z = 0")
+    _add_json_argument(parser)
+
+
+def _risk(arguments: argparse.Namespace) -> int:
+    path = _path_poses(arguments.path)
+    with _client(arguments) as client:
+        answer = client.risk(
+            path,
+            arguments.sphere,
+            unknown=arguments.unknown,
+            resolution_m=arguments.resolution,
+            correlation_m=arguments.correlation,
+            dims=2 if arguments.planar else 3,
+        )
+    arrays = {
+        name: getattr(answer, name) for name in ("max_probability", "union_probability", "unknown_share")
+    }
+    totals = {
+        name: getattr(answer, name)
+        for name in (
+            "path_max_probability",
+            "path_union_probability",
+            "path_unknown_share",
+            "n_cells",
+            "resolution_m",
+            "revision",
+        )
+    }
+    _write_json(arguments.json, totals | {name: array.tolist() for name, array in arrays.items()})
+    if arguments.json == "-":
+        return EXIT_OK
+    shown = 40
+    rows = [
+        [
+            str(i),
+            *[f"{c:.2f}" for c in path[i, :3, 3]],
+            f"{answer.max_probability[i]:.4f}",
+            f"{answer.union_probability[i]:.4f}",
+            f"{answer.unknown_share[i]:.1%}",
+        ]
+        for i in range(min(len(path), shown))
+    ]
+    _say(_table(["pose", "x", "y", "z", "max", "union", "unknown"], rows))
+    if len(path) > shown:
+        _say(f"... and {len(path) - shown} more (--json FILE has all)")
+    _say(
+        f"path: max {answer.path_max_probability:.4f}, union {answer.path_union_probability:.4f}, "
+        f"{answer.path_unknown_share:.1%} unknown of {answer.n_cells} cells of {answer.resolution_m:g} m, "
+        f"revision {answer.revision}"
+    )
+    return EXIT_OK
+
+
+def _path_poses(path: Path) -> np.ndarray[Any, np.dtype[np.float64]]:
+    """(P, 4, 4) from rows of x y z, x y z yaw, or 3x4 matrices."""
+    rows = _read_table(path, (3, 4, 12), "poses: x y z, x y z yaw, or 12 numbers of a 3x4 matrix")
+    poses = np.tile(np.eye(4), (len(rows), 1, 1))
+    if rows.shape[1] == 12:
+        poses[:, :3] = rows.reshape(-1, 3, 4)
+        return poses
+    poses[:, :3, 3] = rows[:, :3]
+    if rows.shape[1] == 4:
+        cos, sin = np.cos(rows[:, 3]), np.sin(rows[:, 3])
+        poses[:, 0, 0], poses[:, 0, 1], poses[:, 1, 0], poses[:, 1, 1] = cos, -sin, sin, cos
+    return poses
+
+
+def _add_unknown_argument(parser: Any, default: str) -> None:
+    parser.add_argument(
+        "--unknown",
+        choices=[kind.value for kind in messages.Unknown],
+        default=default,
+        help=f"what unobserved space is taken for (default {default}; prior = 0.5)",
+    )
+
+
+# --- export --------------------------------------------------------------------------------------------------------
+
+
+def _add_export(commands: Any) -> None:
+    parser = _command(
+        commands,
+        "export",
+        _export,
+        help="the map as a file of another program: ply, npz, pgm, bt",
+        description="""Write the map as a file that other programs read. Maps larger than one answer are fetched part by part.
+
+  ply   kernels, all ten numbers of each, coloured by what they say
+  npz   kernels, as `potclient.KernelSet.load` reads them
+  pgm   occupancy in the plane and its YAML, for Nav2's map_server: 0 occupied, 254 free, 205 unknown
+  bt    occupancy as a binary OctoMap: observed cells only
+
+For pgm, --band says which heights matter to the robot; a map without height needs none.""",
+        epilog="""examples:
+  potclient export ply -o kernels.ply
+  potclient export pgm --resolution 0.05 --band 0.1 1.5 -o map.pgm
+  potclient export bt --resolution 0.2 --lower -20 -20 -1 --upper 20 20 4 -o map.bt""",
+    )
+    parser.add_argument("kind", choices=("ply", "npz", "pgm", "bt"))
+    parser.add_argument("-o", "--out", type=Path, required=True, metavar="FILE", help="file to write")
+    parser.add_argument(
+        "--lower", type=float, nargs=3, metavar=("X", "Y", "Z"), help="corner of the box (default: the map's)"
+    )
+    parser.add_argument("--upper", type=float, nargs=3, metavar=("X", "Y", "Z"))
+    parser.add_argument("--resolution", type=_positive, metavar="METRES", help="pgm, bt: cell edge")
+    parser.add_argument(
+        "--band", type=float, nargs=2, metavar=("LOW", "HIGH"), help="pgm: heights that count, m"
+    )
+    parser.add_argument(
+        "--occupied", type=float, metavar="P", help="occupied from here on (default: pgm 0.65, bt 0.5)"
+    )
+    parser.add_argument("--free", type=float, metavar="P", help="free below (default: pgm 0.25, bt 0.5)")
+    parser.add_argument("-q", "--quiet", action="store_true", help="no progress bar")
+    parser.set_defaults(timeout=60.0)
+
+
+def _export(arguments: argparse.Namespace) -> int:
+    from potclient import export
+
+    is_grid = arguments.kind in ("pgm", "bt")
+    if is_grid and arguments.resolution is None:
+        raise UsageError(f"export {arguments.kind}: give --resolution METRES")
+    grid_flags = (arguments.resolution, arguments.band, arguments.occupied, arguments.free)
+    if not is_grid and any(flag is not None for flag in grid_flags):
+        raise UsageError(f"export {arguments.kind}: kernels have no cells; only --lower and --upper apply")
+    if arguments.kind == "bt" and arguments.band is not None:
+        raise UsageError("export bt: --band is for pgm; give the heights with --lower and --upper")
+    with _client(arguments) as client, _part_bar(arguments.quiet) as progress:
+        if is_grid:
+            box = _export_box(arguments, client)
+            run = export.export_pgm if arguments.kind == "pgm" else export.export_bt
+            thresholds = {"occupied_above": arguments.occupied, "free_below": arguments.free}
+            given = {name: value for name, value in thresholds.items() if value is not None}
+            done = run(client, arguments.out, box, progress=progress, **given)
+        else:
+            write = export.export_ply if arguments.kind == "ply" else export.export_npz
+            done = write(
+                client, arguments.out, lower=arguments.lower, upper=arguments.upper, progress=progress
+            )
+    what = {"ply": "kernels", "npz": "kernels", "pgm": "pixels", "bt": "voxels"}[arguments.kind]
+    _say(f"wrote {arguments.out}: {done.n} {what}, revision {done.revisions[0] if done.revisions else 0}")
+    if arguments.kind == "pgm":
+        _say(f"wrote {arguments.out.with_suffix('.yaml')}")
+    if len(done.revisions) > 1:
+        _note(f"the map changed meanwhile: revisions {done.revisions[0]} to {done.revisions[-1]}")
+    return EXIT_OK
+
+
+def _export_box(arguments: argparse.Namespace, client: MapClient) -> Any:
+    from potclient.export import CellBox, bounds_of
+
+    lower, upper = arguments.lower, arguments.upper
+    if lower is None or upper is None:
+        low, high = bounds_of(client)
+        lower = low.tolist() if lower is None else lower
+        upper = high.tolist() if upper is None else upper
+    if arguments.kind == "pgm":
+        if arguments.band is None and lower[2] != upper[2]:
+            raise UsageError(
+                f"export pgm: the map spans {lower[2]:g} to {upper[2]:g} m in height; say with --band LOW HIGH which matter"
+            )
+        if arguments.band is not None:
+            lower, upper = [*lower[:2], arguments.band[0]], [*upper[:2], arguments.band[1]]
+    return CellBox.around(lower, upper, arguments.resolution)
+
+
+@contextlib.contextmanager
+def _part_bar(quiet: bool) -> Iterator[Callable[[int, int], None] | None]:
+    """A progress bar of parts when stderr is a terminal."""
+    progress = None if quiet or not sys.stderr.isatty() else _rich_progress(0, "parts")
+    if progress is None:
+        yield None
+        return
+    bar, task = progress
+    with bar:
+        yield lambda done, total: bar.update(task, completed=done, total=total)
 
 
 # --- watch ---------------------------------------------------------------------------------------------------------
@@ -487,6 +842,7 @@ and rejected by the server with a reason + unknown. Robots drop what the server 
 exit status is 1 if a cloud has no known fate, or a question failed for another reason than overload.""",
         epilog="""examples:
   potclient load --robots 4 --hz 5 --planners 2 --seconds 10
+  potclient load --robots 8 --dataset town:downtown:dynamic
   potclient load --robots 32 --hz 10 --points 20000 --dataset kitti/00 --json load.json""",
     )
     parser.add_argument("--robots", type=int, default=4, help="default 4")
@@ -498,7 +854,9 @@ exit status is 1 if a cloud has no known fate, or a question failed for another 
     parser.add_argument("--seconds", type=_positive, default=10.0, help="default 10")
     parser.add_argument("--points", type=int, default=5000, help="points a cloud (default 5000)")
     parser.add_argument("--query-points", type=int, default=1000, help="points a question (default 1000)")
-    parser.add_argument("--dataset", default="generated", help="recording to send (default: generated)")
+    parser.add_argument(
+        "--dataset", default="generated", help="recording to send, e.g. town:suburb (default: generated)"
+    )
     parser.add_argument(
         "--receipt-timeout", type=_positive, default=30.0, metavar="SECONDS", help="default 30"
     )
@@ -602,33 +960,76 @@ def _add_atoms(commands: Any) -> None:
         commands,
         "atoms",
         _atoms,
-        help="the dictionary of atoms, or one of them",
-        description="List the dictionary's atoms with how often each has served, or fetch one whole.",
+        help="the dictionary of atoms: list, get, add, remove",
+        description="""List the dictionary's atoms with how often each has served, fetch one whole, or change the dictionary.
+
+A change counts for all maps of the server, from their next scan on. The server refuses atoms that are unsound or that it has
+already, and says why. A file holds one atom; `potserver atoms export` takes them out of a dictionary.""",
         epilog="""examples:
   potclient atoms
-  potclient atoms wall.1 -o wall.npz""",
+  potclient atoms get terraces-90-s2 -o terraces-90-s2.atom
+  potclient atoms add terraces-90-s2.atom corner.atom
+  potclient atoms remove terraces-90-s2""",
     )
-    parser.add_argument("atom_id", nargs="?", metavar="ID")
     parser.add_argument(
-        "-o", "--out", type=Path, metavar="FILE", help="save the atom's kernels (KernelSet.load reads them)"
+        "verb", nargs="?", choices=("list", "get", "add", "remove"), default="list", help="default: list"
+    )
+    parser.add_argument(
+        "names", nargs="*", metavar="ID|FILE", help="an ID to get; FILEs to add; IDs to remove"
+    )
+    parser.add_argument(
+        "-o", "--out", type=Path, metavar="FILE", help="get: save the atom (`potclient.Atom.load` reads it)"
     )
     _add_json_argument(parser)
 
 
 def _atoms(arguments: argparse.Namespace) -> int:
-    if arguments.out is not None and arguments.atom_id is None:
-        raise UsageError("atoms: -o saves one atom; name its ID")
+    verb, names = arguments.verb, arguments.names
+    if verb == "list" and names:
+        raise UsageError(f"atoms: list takes no names; `potclient atoms get {names[0]}` shows one")
+    if verb == "get" and len(names) != 1:
+        raise UsageError("atoms: get needs one ID")
+    if verb in ("add", "remove") and not names:
+        raise UsageError(f"atoms: {verb} what? name {'FILEs' if verb == 'add' else 'IDs'}")
+    if arguments.out is not None and verb != "get":
+        raise UsageError("atoms: -o saves the atom that `get ID` fetches")
+    if verb in ("add", "remove"):
+        return _change_atoms(arguments)
     with _client(arguments) as client:
-        if arguments.atom_id is None:
+        if verb == "list":
             atoms = client.atoms()
         else:
-            atom = client.atom(arguments.atom_id)
+            atom = client.atom(names[0])
             atoms = [atom.info]
             if arguments.out is not None:
-                atom.kernels.save(arguments.out)
+                atom.save(arguments.out)
     _write_json(arguments.json, [_plain(atom) for atom in atoms])
-    if arguments.json == "-":
-        return EXIT_OK
+    if arguments.json != "-":
+        _say_atoms(atoms)
+        if verb == "get":
+            _say("\n".join(f"{key}: {value}" for key, value in sorted(atoms[0].provenance.items())))
+    return EXIT_OK
+
+
+def _change_atoms(arguments: argparse.Namespace) -> int:
+    """Every file is read before the first atom is sent; the first refusal ends the command."""
+    adds = arguments.verb == "add"
+    done = "added" if adds else "removed"
+    atoms = [Atom.load(name) for name in arguments.names] if adds else []
+    changes = []
+    with _client(arguments) as client:
+        try:
+            for change in map(client.add_atom, atoms) if adds else map(client.remove_atom, arguments.names):
+                changes.append(change)
+                kept = "saved" if change.persisted else "until the server restarts"
+                if arguments.json != "-":
+                    _say(f"{change.atom_id} {done}, {change.n_atoms} atoms, {kept}")
+        finally:
+            _write_json(arguments.json, [_plain(change) for change in changes])
+    return EXIT_OK
+
+
+def _say_atoms(atoms: list[messages.AtomInfo]) -> None:
     heads = ["atom", "dims", "hits", "free", "kernels", "radius m", "width deg", "used", "source"]
     rows = [
         [
@@ -645,9 +1046,6 @@ def _atoms(arguments: argparse.Namespace) -> int:
         for a in atoms
     ]
     _say(_table(heads, rows))
-    if arguments.atom_id is not None:
-        _say("\n".join(f"{key}: {value}" for key, value in sorted(atoms[0].provenance.items())))
-    return EXIT_OK
 
 
 def _add_control(commands: Any) -> None:
@@ -666,6 +1064,84 @@ def _control(arguments: argparse.Namespace) -> int:
     with _client(arguments) as client:
         reply = client.control(arguments.verb)
     _say(f"{reply.verb}: {reply.message} (revision {reply.map_revision})")
+    return EXIT_OK
+
+
+# --- town ----------------------------------------------------------------------------------------------------------
+
+
+def _add_town(commands: Any) -> None:
+    parser = commands.add_parser(
+        "town",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        help="write a drive through a made-up town",
+        description="""Drive through a made-up town with a LiDAR model and write the scans, their poses and times, all settings
+(recording.json) and a picture of the town (plan.png) into a new folder. No server is needed. Same options, same files.
+
+STYLE:
+  terraces   narrow streets of row houses close to the kerb, garden walls, cars parked on both sides
+  suburb     detached houses set back behind lawns, hedges and trees, few cars
+  downtown   large blocks of tall buildings on wide streets, arcades, open squares, rows of trees and poles
+  offices    indoors: corridors, rooms with doors, desks, chairs and cupboards
+
+Other commands take towns as they are, as the dataset town:STYLE[:2d][:dynamic][:SENSOR][:LENGTHm][:SEED].""",
+        epilog="""examples:
+  potclient town terraces -o drive
+  potclient town suburb --dynamic --length 300 --every 2 --max-range 25 -o drive
+  potclient town offices --2d --seed 7 --length 100 --every 0.5 --sensor planar180 -o drive
+  potclient publish drive                   play it into a map
+  potclient publish town:terraces:300m      the same without files""",
+    )
+    parser.set_defaults(command=_town)
+    parser.add_argument("style", metavar="STYLE")
+    parser.add_argument("--2d", action="store_true", dest="planar", help="a planar scanner; z = 0")
+    parser.add_argument(
+        "--dynamic", action="store_true", help="cars (in offices: people) move, parked ones leave"
+    )
+    parser.add_argument("--seed", type=int, default=0, help="another town (default 0)")
+    parser.add_argument(
+        "--length", type=_positive, default=1000.0, metavar="METRES", help="of the drive (default 1000)"
+    )
+    parser.add_argument(
+        "--every", type=_positive, metavar="METRES", help="distance of scans (default: all, ten a second)"
+    )
+    parser.add_argument(
+        "--sensor",
+        help="hdl64, vlp16, os64, planar360 or planar180 (default: hdl64; indoors os64; in 2D planar360)",
+    )
+    parser.add_argument(
+        "--max-range",
+        type=_positive,
+        metavar="METRES",
+        help="beams beyond are free up to here and have no echo",
+    )
+    parser.add_argument("-o", "--out", type=Path, required=True, metavar="FOLDER", help="new folder to write")
+    parser.add_argument("-q", "--quiet", action="store_true", help="no progress bar")
+
+
+def _town(arguments: argparse.Namespace) -> int:
+    from potclient.towns import PERIOD_S, TownName, open_town
+    from potclient.towns.export import write_drive
+
+    if arguments.seed < 0:
+        raise UsageError(f"--seed {arguments.seed}: need 0 or more")
+    words = ["town", arguments.style, *["2d"] * arguments.planar, *["dynamic"] * arguments.dynamic]
+    words += [] if arguments.sensor is None else [arguments.sensor]
+    name = TownName.parse(":".join([*words, f"{arguments.length:.6f}m", str(arguments.seed)]))
+    recording = open_town(str(name), max_range_m=arguments.max_range)
+    if arguments.every is not None:
+        spacing = recording.town.style.speed_m_s * PERIOD_S
+        recording = recording[:: max(1, round(arguments.every / spacing))]
+    progress = None if arguments.quiet or not sys.stderr.isatty() else _rich_progress(len(recording))
+    if progress is None:
+        write_drive(recording, arguments.out)
+    else:
+        bar, task = progress
+        with bar:
+            write_drive(recording, arguments.out, on_scan=lambda: bar.advance(task))
+    _say(
+        f"{arguments.out}: {len(recording)} scans over {recording.town.drive.length_m:g} m; {'; '.join(recording.notes)}"
+    )
     return EXIT_OK
 
 

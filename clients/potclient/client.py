@@ -10,13 +10,14 @@ import atexit
 import contextlib
 import dataclasses
 import functools
+import itertools
 import logging
 import math
 import threading
 import time
 import weakref
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from types import TracebackType
 from typing import Any, TypeVar
 
@@ -25,6 +26,7 @@ import numpy as np
 import zenoh
 from numpy.typing import ArrayLike, NDArray
 
+from potclient.atoms import Atom
 from potclient.errors import (
     BadReplyError,
     ClosedError,
@@ -34,27 +36,29 @@ from potclient.errors import (
     OverloadedError,
     PotclientError,
     QueryTimeoutError,
+    TooLargeError,
     UsageError,
     error_from_reply,
 )
 from potclient.feed import Feed, Numbering
 from potclient.kernels import KernelSet
 from potclient.results import (
-    Atom,
     FeedCounts,
     Float32,
     Float64,
     Grid,
     Occupancy,
+    Rays,
     Receipt,
+    Risk,
     TransportedParams,
     as_points,
 )
 from potclient.session import DEFAULT_ENDPOINT, SessionOptions, open_session
 from potschemas import messages
 from potschemas.keys import DEFAULT_ROOT, MapKeys, check_id, stats_key
-from potschemas.messages import DType, Message
-from potschemas.wire import WireError, decode, decode_array, encode, encode_array, encoding_of
+from potschemas.messages import Message
+from potschemas.wire import WireError, decode, encode, encode_array, encoding_of
 
 log = logging.getLogger("potclient")
 
@@ -63,6 +67,7 @@ ProgressCallback = Callable[[int, int], None]  # (parts received, parts in all)
 
 _CHUNK_POINTS = 100_000  # points a query at most, whatever the server would take
 _SPLIT_ABOVE = 20_000  # up to here one query is sent without asking for the server's limits
+_CHUNK_RAYS = 20_000  # rays a query at most
 _CHUNKS_IN_FLIGHT = 4
 _CHUNK_RETRIES = 8
 _DIAGNOSIS_TIMEOUT_S = 0.5
@@ -265,7 +270,7 @@ class MapClient:
         )
 
     def wait_for_match(self, op: str, timeout_s: float | None = None) -> None:
-        """Wait until somebody answers questions of a kind, warm or not: points, grid, params, atoms, info or integrate.
+        """Wait until somebody answers questions of a kind, warm or not: one of `keys.QUERY_OPS`.
 
         Raises:
             NoServerError: nobody does within `timeout_s` (default: the client's).
@@ -478,7 +483,9 @@ class MapClient:
 
     # --- questions -----------------------------------------------------------------------------------------------------------
 
-    def occupancy(self, points: ArrayLike, *, timeout_s: float | None = None) -> Occupancy:
+    def occupancy(
+        self, points: ArrayLike, *, with_gradient: bool = False, timeout_s: float | None = None
+    ) -> Occupancy:
         """How likely each point is occupied, and how sure the map is.
 
         Requests beyond the server's limits are split; the parts may then come from neighbouring revisions of the map, which
@@ -486,6 +493,7 @@ class MapClient:
 
         Args:
             points: (N, 3), or (N, 2) with z = 0; m, map frame. float32 input travels as float32.
+            with_gradient: Bring the gradients of the mean and of the latent mean too.
             timeout_s: Of one query; None takes the client's. Parts of a split request queue behind each other and may take
                 four times as long.
         Raises:
@@ -496,16 +504,23 @@ class MapClient:
         if len(queries) == 0:
             empty = np.zeros(0, np.float32)
             return Occupancy(
-                mean=empty, var=empty, latent_mean=empty, latent_var=empty, observed=np.zeros(0, np.bool_)
+                mean=empty,
+                var=empty,
+                latent_mean=empty,
+                latent_var=empty,
+                observed=np.zeros(0, np.bool_),
+                gradient=np.zeros((0, 3), np.float32) if with_gradient else None,
+                latent_gradient=np.zeros((0, 3), np.float32) if with_gradient else None,
             )
         step = len(queries) if len(queries) <= _SPLIT_ABOVE else self._points_a_query(queries.itemsize * 3)
         chunks = [queries[i : i + step] for i in range(0, len(queries), step)]
         if len(chunks) == 1:
-            return self._decode_occupancy(self._start_points(chunks[0], timeout_s), len(queries))
-        return Occupancy.concatenate(list(self._occupancy_of_chunks(chunks, timeout_s)))
+            replies = self._start_points(chunks[0], timeout_s, with_gradient)
+            return self._decode_occupancy(replies, len(queries), with_gradient)
+        return Occupancy.concatenate(list(self._occupancy_of_chunks(chunks, timeout_s, with_gradient)))
 
     def _occupancy_of_chunks(
-        self, chunks: list[NDArray[Any]], timeout_s: float | None
+        self, chunks: list[NDArray[Any]], timeout_s: float | None, with_gradient: bool
     ) -> Iterator[Occupancy]:
         timeout_s = _CHUNKS_IN_FLIGHT * (self._timeout_s if timeout_s is None else timeout_s)
         started: deque[tuple[NDArray[Any], Iterator[zenoh.Sample]]] = deque()
@@ -513,26 +528,32 @@ class MapClient:
         while waiting or started:
             while waiting and len(started) < _CHUNKS_IN_FLIGHT:
                 chunk = waiting.popleft()
-                started.append((chunk, self._start_points(chunk, timeout_s)))
+                started.append((chunk, self._start_points(chunk, timeout_s, with_gradient)))
             chunk, replies = started.popleft()
             for attempt in range(_CHUNK_RETRIES + 1):
                 try:
-                    yield self._decode_occupancy(replies, len(chunk))
+                    yield self._decode_occupancy(replies, len(chunk), with_gradient)
                     break
                 except OverloadedError as error:
                     if attempt == _CHUNK_RETRIES:
                         raise
                     time.sleep(error.retry_after_s or 0.1)
-                    replies = self._start_points(chunk, timeout_s)
+                    replies = self._start_points(chunk, timeout_s, with_gradient)
 
-    def _start_points(self, chunk: NDArray[Any], timeout_s: float | None) -> Iterator[zenoh.Sample]:
+    def _start_points(
+        self, chunk: NDArray[Any], timeout_s: float | None, with_gradient: bool
+    ) -> Iterator[zenoh.Sample]:
         timeout_s = self._timeout_s if timeout_s is None else timeout_s
-        return self._ask(
-            "points", messages.PointsQuery(points=encode_array(chunk), deadline_ms=timeout_s * 1e3), timeout_s
+        request = messages.PointsQuery(
+            points=encode_array(chunk),
+            deadline_ms=timeout_s * 1e3,
+            with_gradient=True if with_gradient else messages.ABSENT,
         )
+        return self._ask("points", request, timeout_s)
 
-    def _decode_occupancy(self, replies: Iterator[zenoh.Sample], n: int) -> Occupancy:
-        return Occupancy.from_message(_decode(next(replies).payload, messages.Occupancy), n)
+    def _decode_occupancy(self, replies: Iterator[zenoh.Sample], n: int, with_gradient: bool) -> Occupancy:
+        message = _decode(next(replies).payload, messages.Occupancy)
+        return Occupancy.from_message(message, n, with_gradient=with_gradient)
 
     def _points_a_query(self, bytes_a_point: int) -> int:
         if self._info is None:
@@ -586,6 +607,121 @@ class MapClient:
         assert assembly is not None, "_ask raises when there is no reply"
         return assembly.finish()
 
+    def rays(
+        self,
+        origins: ArrayLike,
+        directions: ArrayLike,
+        max_range_m: float,
+        *,
+        quantiles: Sequence[float] = (0.05, 0.5, 0.95),
+        unknown: messages.Unknown | str = messages.Unknown.PRIOR,
+        width_m: float | None = None,
+        step_m: float | None = None,
+        timeout_s: float | None = None,
+    ) -> Rays:
+        """Where rays first return: expected range, its standard deviation, quantiles, and where the map does not know.
+
+        The hazard of a return along a ray is -ln(1 - p) / width, with p the mean of the occupancy: a stretch of one width with
+        constant p stops the ray with probability p. Requests that the server finds too large are halved, and halved again;
+        their parts may come from neighbouring revisions of the map.
+
+        Args:
+            origins: (N, 3) or (N, 2) m, map frame; or one of them, for all rays.
+            directions: (N, 3) or (N, 2), of any length but 0.
+            max_range_m: Rays end here.
+            quantiles: Ascending, of the range to answer.
+            unknown: What rays take unobserved space for: occupied (it stops them), free, or prior (p = 0.5).
+            width_m: The length over which p counts as one trial; None = the kernels' own there.
+            step_m: Longest step of the summation; None = fine enough for the map's kernels.
+            timeout_s: Of one query; None takes the client's.
+        Raises:
+            MapServerError, NoServerError, QueryTimeoutError, LostReplyError, UsageError: see there.
+        """
+        ways = as_points(directions)
+        starts = as_points(origins)
+        if len(starts) == 1:
+            starts = np.broadcast_to(starts, ways.shape)
+        if len(starts) != len(ways):
+            raise UsageError(f"rays: {len(starts)} origins and {len(ways)} directions")
+        kind = _unknown(unknown)
+        levels = tuple(float(q) for q in quantiles)
+        if not all(a < b for a, b in itertools.pairwise((0.0, *levels, 1.0))):
+            raise UsageError(f"quantiles {list(levels)}: need ascending numbers between 0 and 1")
+        timeout_s = self._timeout_s if timeout_s is None else timeout_s
+        parts: list[Rays] = []
+        first, step = 0, min(max(len(ways), 1), _CHUNK_RAYS)
+        while first < len(ways) or not parts:
+            run = slice(first, first + step)
+            request = messages.RaysQuery(
+                origins=encode_array(np.ascontiguousarray(starts[run])),
+                directions=encode_array(ways[run].astype(np.float32)),
+                max_range_m=_positive("max_range_m", max_range_m),
+                quantiles=list(levels),
+                unknown=kind,
+                width_m=None if width_m is None else _positive("width_m", width_m),
+                step_m=None if step_m is None else _positive("step_m", step_m),
+                deadline_ms=timeout_s * 1e3,
+            )
+            n = len(ways[run])
+            try:
+                reply = self._ask_one("rays", request, messages.Rays, timeout_s)
+            except TooLargeError:
+                if n <= 1:
+                    raise
+                step = n // 2
+                continue
+            parts.append(Rays.from_message(reply, n, levels))
+            first += step
+        return Rays.concatenate(parts)
+
+    def risk(
+        self,
+        path: ArrayLike,
+        spheres: ArrayLike,
+        *,
+        unknown: messages.Unknown | str = messages.Unknown.OCCUPIED,
+        resolution_m: float | None = None,
+        correlation_m: float | None = None,
+        dims: int = 3,
+        timeout_s: float | None = None,
+    ) -> Risk:
+        """How likely a robot on a path touches something; all from one revision of the map.
+
+        The robot covers the cells of a lattice, fixed to the map, whose centres lie in its spheres, and the cells of the
+        spheres' own centres. The poses count as they are: nothing is covered between them, so give them close together.
+
+        Args:
+            path: (P, 4, 4) T_map_body, rigid; or one of them.
+            spheres: (S, 4): centre, m, body frame, and radius, m; or one of them.
+            unknown: What unobserved cells are taken for: occupied, free, or prior (p = 0.5).
+            resolution_m: Edge of a cell; None = half the smallest radius.
+            correlation_m: Edge of a cube that counts as one trial in the union; None = the kernels' own width there.
+            dims: 2 takes the spheres for discs in the plane z = 0, for planar maps.
+            timeout_s: Of the query; None takes the client's.
+        Raises:
+            MapServerError, NoServerError, QueryTimeoutError, LostReplyError, UsageError: see there.
+        """
+        poses, balls = _numbers("path", path), _numbers("spheres", spheres)
+        poses = poses[None] if poses.ndim == 2 else poses
+        balls = balls[None] if balls.ndim == 1 else balls
+        if poses.ndim != 3 or poses.shape[1:] != (4, 4):
+            raise UsageError(f"risk: path has shape {poses.shape}, need (P, 4, 4)")
+        if balls.ndim != 2 or balls.shape[1] != 4:
+            raise UsageError(f"risk: spheres have shape {balls.shape}, need (S, 4): x y z radius")
+        if dims not in (2, 3):
+            raise UsageError(f"risk: dims is {dims}, need 2 or 3")
+        timeout_s = self._timeout_s if timeout_s is None else timeout_s
+        request = messages.RiskQuery(
+            path=encode_array(np.ascontiguousarray(poses)),
+            spheres=encode_array(np.ascontiguousarray(balls)),
+            unknown=_unknown(unknown),
+            resolution_m=None if resolution_m is None else _positive("resolution_m", resolution_m),
+            correlation_m=None if correlation_m is None else _positive("correlation_m", correlation_m),
+            dims=dims,
+            deadline_ms=timeout_s * 1e3,
+        )
+        return Risk.from_message(self._ask_one("risk", request, messages.Risk, timeout_s), len(poses))
+
     def params(
         self,
         lower: ArrayLike | None = None,
@@ -599,27 +735,48 @@ class MapClient:
             IncompleteReplyError: parts are missing, doubled, or from different revisions.
             MapServerError, NoServerError, QueryTimeoutError, LostReplyError, UsageError: see there.
         """
+        parts = {part: kernels for part, _, kernels in self.params_parts(lower, upper, timeout_s=timeout_s)}
+        return KernelSet.concatenate(parts[i] for i in sorted(parts))
+
+    def params_parts(
+        self,
+        lower: ArrayLike | None = None,
+        upper: ArrayLike | None = None,
+        *,
+        timeout_s: float | None = None,
+    ) -> Iterator[tuple[int, int, KernelSet]]:
+        """The kernels as `params` gives them, part by part as they come, in any order: for maps that should not be held whole.
+
+        Yields:
+            The part's number, how many parts there are, and its kernels.
+        Raises:
+            IncompleteReplyError: parts are missing (known after the last one), doubled, or from different revisions.
+            MapServerError, NoServerError, QueryTimeoutError, LostReplyError, UsageError: see there.
+        """
         timeout_s = self._timeout_s if timeout_s is None else timeout_s
         request = messages.ParamsQuery(
             lower=None if lower is None else _corner(lower, "lower").tolist(),
             upper=None if upper is None else _corner(upper, "upper").tolist(),
             deadline_ms=timeout_s * 1e3,
         )
-        parts: dict[int, messages.ParamsPart] = {}
+        seen: set[int] = set()
+        totals: set[int] = set()
+        revisions: set[int] = set()
         for sample in self._ask("params", request, timeout_s):
             part = _decode(sample.payload, messages.ParamsPart)
-            if part.part in parts:
+            if part.part in seen:
                 raise IncompleteReplyError(
                     f"params: part {part.part} came twice; do two servers serve this map?"
                 )
-            parts[part.part] = part
-        _check_parts(
-            "params", parts, {p.n_parts for p in parts.values()}, {p.map_revision for p in parts.values()}
-        )
-        return KernelSet.concatenate(
-            KernelSet.from_message(parts[i].kernels, map_revision=parts[i].map_revision)
-            for i in sorted(parts)
-        )
+            seen.add(part.part)
+            totals.add(part.n_parts)
+            revisions.add(part.map_revision)
+            yield (
+                part.part,
+                part.n_parts,
+                KernelSet.from_message(part.kernels, map_revision=part.map_revision),
+            )
+        _check_parts("params", seen, totals, revisions)
 
     def atoms(self, *, timeout_s: float | None = None) -> list[messages.AtomInfo]:
         """The server's dictionary, one line an atom."""
@@ -631,20 +788,30 @@ class MapClient:
         Raises:
             UnknownAtomError: there is none of this id.
         """
-        reply = self._ask_one("atoms", messages.AtomsQuery(atom_id=atom_id), messages.Atom, timeout_s)
-        try:
-            hits, free = (
-                decode_array(getattr(reply, name), name, dtypes=(DType.FLOAT32,), shape=(None, 3))
-                for name in ("hit_points", "free_points")
-            )
-        except WireError as error:
-            raise BadReplyError(f"atom {atom_id}: {error}") from error
-        return Atom(
-            info=reply.info,
-            hit_points=hits.astype(np.float32),
-            free_points=free.astype(np.float32),
-            kernels=KernelSet.from_message(reply.kernels),
-        )
+        query = messages.AtomsQuery(atom_id=atom_id)
+        return Atom.from_message(self._ask_one("atoms", query, messages.Atom, timeout_s))
+
+    def add_atom(self, atom: Atom, *, timeout_s: float | None = None) -> messages.AtomsChanged:
+        """Put an atom into the server's dictionary, for all its maps: scans that are integrated from now on may use it.
+
+        Returns:
+            How many atoms there are now, and whether the change outlives the server (`persisted`).
+        Raises:
+            AtomRefusedError: it may not join; `reason` says which rule it breaks.
+            ReadOnlyError: the server takes no changes.
+            ShapeError, BadPointsError, EmptyError, TooLargeError: its arrays are unsound.
+            QueryTimeoutError, LostReplyError: see there; the atom may or may not have joined, `atoms` tells.
+        """
+        query = messages.AtomsQuery(action=messages.AtomsAction.ADD, atom=atom.to_message())
+        return self._ask_one("atoms", query, messages.AtomsChanged, timeout_s)
+
+    def remove_atom(self, atom_id: str, *, timeout_s: float | None = None) -> messages.AtomsChanged:
+        """Take an atom out of the server's dictionary; maps keep the kernels that were carried from it.
+
+        Returns, and raises beside UnknownAtomError: as `add_atom`.
+        """
+        query = messages.AtomsQuery(action=messages.AtomsAction.REMOVE, atom_id=atom_id)
+        return self._ask_one("atoms", query, messages.AtomsChanged, timeout_s)
 
     def info(self, *, timeout_s: float | None = None) -> messages.Info:
         """What the server is, what it holds, and what it accepts."""
@@ -891,12 +1058,12 @@ class _GridAssembly:
         )
 
 
-def _check_parts(what: str, parts: dict[int, Any], totals: set[int], revisions: set[int]) -> None:
+def _check_parts(what: str, parts: set[int], totals: set[int], revisions: set[int]) -> None:
     if len(revisions) != 1:
         raise IncompleteReplyError(
             f"{what}: parts of revisions {sorted(revisions)}; do two servers serve this map?"
         )
-    if len(totals) != 1 or set(parts) != set(range(next(iter(totals)))):
+    if len(totals) != 1 or parts != set(range(next(iter(totals)))):
         raise IncompleteReplyError(f"{what}: {len(parts)} of {max(totals)} parts came")
 
 
@@ -962,6 +1129,27 @@ def _pose(T_map_sensor: ArrayLike) -> Float64:
     if pose.shape != (4, 4):
         raise UsageError(f"T_map_sensor: shape {pose.shape}, need (4, 4)")
     return pose
+
+
+def _numbers(name: str, value: ArrayLike) -> Float64:
+    try:
+        return np.asarray(value, np.float64)
+    except (TypeError, ValueError) as error:
+        raise UsageError(f"{name}: not an array of numbers ({error})") from error
+
+
+def _positive(name: str, value: float) -> float:
+    if not (math.isfinite(value) and value > 0):
+        raise UsageError(f"{name} is {value}, need a positive number of metres")
+    return float(value)
+
+
+def _unknown(value: messages.Unknown | str) -> messages.Unknown:
+    try:
+        return messages.Unknown(value)
+    except ValueError as error:
+        names = ", ".join(kind.value for kind in messages.Unknown)
+        raise UsageError(f"unknown space as {value!r}: need one of {names}") from error
 
 
 def _corner(value: ArrayLike, name: str) -> Float64:

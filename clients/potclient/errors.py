@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from potschemas.messages import ErrorCode, ErrorReply
+from potschemas.messages import ABSENT, ErrorCode, ErrorReply
 
 if TYPE_CHECKING:
     from potclient.results import Receipt
@@ -67,6 +67,7 @@ class MapServerError(PotclientError):
     """The server refused. `code` is contract (`potschemas.messages.ErrorCode`), the text is for people."""
 
     code: str = "internal"
+    reason: str | None = None  # finer than the code, where it has several causes
     receipt: Receipt | None = None  # set where the refusal was a receipt of `MapClient.integrate`
 
     def __init__(
@@ -144,6 +145,18 @@ class UnknownAtomError(MapServerError):
     code = "unknown_atom"
 
 
+class AtomRefusedError(MapServerError):
+    """The atom may not join the dictionary; `reason` says which rule it breaks, e.g. `taken_id`, `duplicate`, `unexplained`."""
+
+    code = "atom_refused"
+
+
+class ReadOnlyError(MapServerError):
+    """The server takes no changes of its dictionary."""
+
+    code = "read_only"
+
+
 class UnsupportedError(MapServerError):
     """No such operation or verb."""
 
@@ -193,9 +206,12 @@ def error_from_code(
 
 def error_from_reply(reply: ErrorReply) -> MapServerError:
     """The exception for a `reply_err` of the server."""
-    return error_from_code(
+    error = error_from_code(
         ErrorCode(reply.code).value,
         reply.message,
         retryable=reply.retryable,
         retry_after_s=reply.retry_after_s,
     )
+    if reply.reason is not ABSENT:
+        error.reason = reply.reason
+    return error

@@ -35,14 +35,14 @@ class LabelledPoints:
 
 
 class HoldOut:
-    """Splits scan after scan, in order, with one seed.
+    """Splits scan after scan with one seed; what is held out of a scan depends on its number alone, not on those before it.
 
     Each held-out beam gives its end (occupied; only if it has an echo) and, if it is longer than 0.5 m, one point that is
     uniform between the sensor and 0.5 m before the end (free).
 
     Args:
         fraction: Share of beams held out, in (0, 1).
-        seed: Of the whole sequence of scans.
+        seed: Together with a scan's number, of what is held out of it.
     Raises:
         UsageError: the fraction is not in (0, 1).
     """
@@ -51,13 +51,21 @@ class HoldOut:
         if not 0.0 < fraction < 1.0:
             raise UsageError(f"hold-out fraction {fraction}: need a number between 0 and 1")
         self.fraction, self.seed = fraction, seed
-        self._rng = np.random.default_rng(seed)
+        self._next = 0
 
-    def split(self, scan: RecordedScan) -> tuple[RecordedScan, LabelledPoints]:
-        """The scan without its held-out beams, and what those beams say."""
+    def split(self, scan: RecordedScan, number: int | None = None) -> tuple[RecordedScan, LabelledPoints]:
+        """The scan without its held-out beams, and what those beams say.
+
+        Args:
+            scan: A whole scan.
+            number: Its number in the recording; default: one more than at the call before, from 0.
+        """
+        number = self._next if number is None else number
+        self._next = number + 1
+        rng = np.random.default_rng((self.seed, number))
         n = len(scan)
-        held = self._rng.random(n) < self.fraction
-        u = self._rng.random(n)
+        held = rng.random(n) < self.fraction
+        u = rng.random(n)
         training = dataclasses.replace(scan, points=scan.points[~held], is_return=scan.is_return[~held])
         ends = scan.points[held].astype(np.float64)
         range_m = np.linalg.norm(ends, axis=1)

@@ -40,6 +40,7 @@ class KernelSet:
     observed_activation: float  # summed activation below which a point counts as unobserved
     prior_var: float  # log-odds^2, the latent variance of an unobserved point
     residual_var: float  # log-odds^2, added in the measure that the summed activation falls short of 1
+    mean_moderation: float = 1.0  # share of the latent variance that pulls the mean towards 0.5
     map_revision: int = 0
 
     def __post_init__(self) -> None:
@@ -67,17 +68,19 @@ class KernelSet:
         arrays: dict[str, Any] = {name: getattr(self, name)[index] for name in _SHAPES}
         return dataclasses.replace(self, **arrays)
 
-    def occupancy(self, points: ArrayLike) -> Occupancy:
+    def occupancy(self, points: ArrayLike, *, gradient: bool = False) -> Occupancy:
         """What these kernels say at points: the formulas of the server, in float64.
 
         With mu = f(x) and s2 = sum_m var_m phi_m^2 + residual_var max(0, 1 - sum_m phi_m):
-        mean = sigmoid(mu / sqrt(1 + pi s2 / 8)) and var = mean (1 - mean) (1 - 1 / sqrt(1 + pi s2 / 8)). Where the summed
+        mean = sigmoid(mu / sqrt(1 + c pi s2 / 8)), c = `mean_moderation`, and
+        var = mean (1 - mean) (1 - 1 / sqrt(1 + pi s2 / 8)). Where the summed
         activation stays below `observed_activation` the answer is 0.5, latent mean 0 and latent variance `prior_var`, and
         `observed` is false. Kernels with an activation under 1e-19 are left out;
         memory is bounded whatever N and K are.
 
         Args:
             points: (N, 3), or (N, 2) with z = 0; m, the kernels' frame.
+            gradient: Give the analytic gradients of the mean and of the latent mean too; both are 0 where unobserved.
         Raises:
             UsageError: wrong shape, or coordinates that are not finite.
         Source: mean, MacKay 1992; variance, Daunizeau 2017 (semi-analytical moments of the logistic-normal).
@@ -85,6 +88,7 @@ class KernelSet:
         queries = as_points(points)
         n, k = len(queries), len(self)
         latent_mean, latent_var, activation = np.zeros(n), np.zeros(n), np.zeros(n)
+        mean_slope, var_slope, activation_slope = np.zeros((3, n, 3))
         if n and k:
             # Distances are taken about a local origin: |x|^2 + |h|^2 - 2 x.h loses centimetres at UTM coordinates.
             origin = self.hinge_mean.mean(axis=0)
@@ -100,13 +104,31 @@ class KernelSet:
                     sums = phi @ weights[columns]
                     activation[rows] += sums[:, 0]
                     latent_mean[rows] += sums[:, 1]
-                    latent_var[rows] += np.square(phi, out=phi) @ weight_var[columns]
+                    if gradient:
+                        h, g = hinges[columns], gamma[columns]
+                        mean_slope[rows] += _slopes(phi, x, h, -2.0 * g * weights[columns, 1])
+                        activation_slope[rows] += _slopes(phi, x, h, -2.0 * g)
+                    np.square(phi, out=phi)
+                    latent_var[rows] += phi @ weight_var[columns]
+                    if gradient:
+                        var_slope[rows] += _slopes(phi, x, h, -4.0 * g * weight_var[columns])
         observed = activation >= self.observed_activation if k else np.zeros(n, np.bool_)
         latent_var += self.residual_var * np.maximum(1.0 - activation, 0.0)
+        # the residual variance falls only where it is there: below an activation of 1
+        var_slope -= np.where(activation < 1.0, self.residual_var, 0.0)[:, None] * activation_slope
         latent_mean[~observed] = 0.0
         latent_var[~observed] = self.prior_var
         scale = 1.0 / np.sqrt(1.0 + (math.pi / 8.0) * latent_var)
-        mean = _sigmoid(latent_mean * scale)
+        pull = 1.0 / np.sqrt(1.0 + (self.mean_moderation * math.pi / 8.0) * latent_var)
+        mean = _sigmoid(latent_mean * pull)
+        slopes: dict[str, Float32] = {}
+        if gradient:
+            by_var = (self.mean_moderation * math.pi / 16.0) * latent_mean * pull**3
+            mean_gradient = (mean * (1.0 - mean))[:, None] * (
+                pull[:, None] * mean_slope - by_var[:, None] * var_slope
+            )
+            for name, slope in (("gradient", mean_gradient), ("latent_gradient", mean_slope)):
+                slopes[name] = np.where(observed[:, None], slope, 0.0).astype(np.float32)
         return Occupancy(
             mean=mean.astype(np.float32),
             var=(mean * (1.0 - mean) * (1.0 - scale)).astype(np.float32),
@@ -114,6 +136,7 @@ class KernelSet:
             latent_var=latent_var.astype(np.float32),
             observed=observed,
             revisions=(self.map_revision,),
+            **slopes,
         )
 
     def save(self, path: str | os.PathLike[str]) -> None:
@@ -128,6 +151,7 @@ class KernelSet:
                 observed_activation=np.float64(self.observed_activation),
                 prior_var=np.float64(self.prior_var),
                 residual_var=np.float64(self.residual_var),
+                mean_moderation=np.float64(self.mean_moderation),
                 map_revision=np.int64(self.map_revision),
                 **{name: getattr(self, name) for name in _SHAPES},
             )
@@ -151,6 +175,8 @@ class KernelSet:
                     observed_activation=float(stored["observed_activation"]),
                     prior_var=float(stored["prior_var"]),
                     residual_var=float(stored["residual_var"]),
+                    # files of before it was a choice have the full share
+                    mean_moderation=float(stored["mean_moderation"]) if "mean_moderation" in stored else 1.0,
                     map_revision=int(stored["map_revision"]),
                     **{
                         name: stored[name].astype(np.float64 if name == "hinge_mean" else np.float32)
@@ -174,6 +200,7 @@ class KernelSet:
             observed_activation=self.observed_activation,
             prior_var=self.prior_var,
             residual_var=self.residual_var,
+            mean_moderation=self.mean_moderation,
         )
 
     @classmethod
@@ -200,6 +227,7 @@ class KernelSet:
                 observed_activation=message.observed_activation,
                 prior_var=message.prior_var,
                 residual_var=message.residual_var,
+                mean_moderation=message.mean_moderation,
                 map_revision=map_revision,
             )
         except WireError as error:
@@ -215,7 +243,10 @@ class KernelSet:
         parts = list(sets)
         if not parts:
             raise UsageError("no kernel sets to join")
-        scalars = {(p.observed_activation, p.prior_var, p.residual_var, p.map_revision) for p in parts}
+        scalars = {
+            (p.observed_activation, p.prior_var, p.residual_var, p.mean_moderation, p.map_revision)
+            for p in parts
+        }
         if len(scalars) > 1:
             raise UsageError(f"kernel sets of different maps or revisions: {sorted(scalars)}")
         arrays: dict[str, Any] = {name: np.concatenate([getattr(p, name) for p in parts]) for name in _SHAPES}
@@ -270,6 +301,11 @@ def _activations(x: Float64, hinges: Float64, gamma: Float64) -> Float64:
     np.maximum(phi, 0.0, out=phi)
     phi *= -gamma
     return np.exp(phi, out=phi)
+
+
+def _slopes(phi: Float64, x: Float64, hinges: Float64, factor: Float64) -> Float64:
+    """(N, 3): sum_m factor_m phi_m (x - h_m)."""
+    return x * (phi @ factor)[:, None] - phi @ (factor[:, None] * hinges)
 
 
 def _sigmoid(x: Float64) -> Float64:

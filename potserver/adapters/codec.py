@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
@@ -25,9 +25,12 @@ from potserver.domain.types import (
     KernelSet,
     MapUpdate,
     Occupancy,
+    PathRisk,
+    RayReturns,
     Scan,
     SectorMatch,
     TileChange,
+    Unknown,
     check_rigid,
 )
 from potserver.errors import (
@@ -36,16 +39,19 @@ from potserver.errors import (
     EmptyError,
     OutOfRangeError,
     PotserverError,
+    ShapeError,
     TooLargeError,
     UnknownRobotError,
     error_classes,
 )
+from potserver.services.atom_store import AtomChange
 from potserver.services.health import Latency
 
 MessageT = TypeVar("MessageT", bound=messages.Message)
 UNKNOWN_SEQ = -1  # in the receipt of a cloud whose number could not be read
 _UNSET_ENCODING = "zenoh/bytes"  # what Zenoh reports when the sender named none
 _MAX_SMALL_BYTES = 4096  # of messages without arrays
+_QUANTILES = (0.05, 0.5, 0.95)  # of a `q/rays` that names none
 _FLOATS = (DType.FLOAT32, DType.FLOAT64)
 _ERRORS = error_classes()
 # float32 would round a sure answer up to certainty, which costs an infinite log-loss when it is wrong
@@ -71,6 +77,7 @@ class PointsRequest(NamedTuple):
 
     points: NDArray[np.floating[Any]]  # (N, 3) or (N, 2) m, map frame
     deadline_ms: float | None
+    with_gradient: bool = False
 
 
 class GridRequest(NamedTuple):
@@ -80,6 +87,39 @@ class GridRequest(NamedTuple):
     upper: list[float]
     resolution: float
     deadline_ms: float | None
+
+
+class RaysRequest(NamedTuple):
+    """A decoded `q/rays`."""
+
+    origins: NDArray[np.floating[Any]]  # (N, 3) or (N, 2) m, map frame
+    directions: NDArray[np.floating[Any]]  # (N, 3) or (N, 2)
+    max_range_m: float
+    quantiles: Sequence[float]
+    unknown: Unknown
+    width_m: float | None
+    step_m: float | None
+    deadline_ms: float | None
+
+
+class RiskRequest(NamedTuple):
+    """A decoded `q/risk`."""
+
+    path: NDArray[np.floating[Any]]  # (P, 4, 4) T_map_body
+    spheres: NDArray[np.floating[Any]]  # (S, 4) m: centre in the body frame, and radius
+    unknown: Unknown
+    resolution_m: float | None
+    correlation_m: float | None
+    dims: int
+    deadline_ms: float | None
+
+
+class AtomsRequest(NamedTuple):
+    """A decoded `q/atoms`."""
+
+    action: messages.AtomsAction
+    atom_id: str | None  # none: list them, or add `atom`
+    atom: Atom | None  # set when one is to be added
 
 
 class ParamsRequest(NamedTuple):
@@ -269,7 +309,57 @@ def decode_points_query(payload: bytes, limits: Limits) -> PointsRequest:
     if len(points) > limits.max_query_points:
         raise TooLargeError(f"query of {len(points)} points, the limit is {limits.max_query_points}")
     _check_coordinates(points, limits.max_coordinate_m, "points")
-    return PointsRequest(points, query.deadline_ms)
+    return PointsRequest(points, query.deadline_ms, query.with_gradient is True)
+
+
+def decode_rays_query(payload: bytes, limits: Limits) -> RaysRequest:
+    """Rays to cast; the query service judges the values.
+
+    Raises:
+        BadMessageError, ShapeError: see `decode_cloud`.
+        TooLargeError: too many bytes or rays.
+    """
+    query = _decode(payload, messages.RaysQuery, limits.max_query_bytes)
+    origins = _decode_array(query.origins, "origins", _FLOATS, (None, (2, 3)))
+    if len(origins) > limits.max_query_rays:
+        raise TooLargeError(f"query of {len(origins)} rays, the limit is {limits.max_query_rays}")
+    return RaysRequest(
+        origins=origins,
+        directions=_decode_array(query.directions, "directions", _FLOATS, origins.shape),
+        max_range_m=query.max_range_m,
+        quantiles=_QUANTILES if query.quantiles is None else query.quantiles,
+        unknown=Unknown(query.unknown.value),
+        width_m=query.width_m,
+        step_m=query.step_m,
+        deadline_ms=query.deadline_ms,
+    )
+
+
+def decode_risk_query(payload: bytes, limits: Limits) -> RiskRequest:
+    """A path and a robot; the query service judges the values.
+
+    Raises:
+        BadMessageError, ShapeError: see `decode_cloud`.
+        TooLargeError: too many bytes, poses or spheres.
+    """
+    query = _decode(payload, messages.RiskQuery, limits.max_query_bytes)
+    path = _decode_array(query.path, "path", (DType.FLOAT64,), (None, 4, 4))
+    spheres = _decode_array(query.spheres, "spheres", _FLOATS, (None, 4))
+    for what, n, limit in (
+        ("poses", len(path), limits.max_query_poses),
+        ("spheres", len(spheres), limits.max_query_spheres),
+    ):
+        if n > limit:
+            raise TooLargeError(f"query of {n} {what}, the limit is {limit}")
+    return RiskRequest(
+        path=path,
+        spheres=spheres,
+        unknown=Unknown(query.unknown.value),
+        resolution_m=query.resolution_m,
+        correlation_m=query.correlation_m,
+        dims=query.dims,
+        deadline_ms=query.deadline_ms,
+    )
 
 
 def decode_grid_query(payload: bytes) -> GridRequest:
@@ -292,9 +382,85 @@ def decode_params_query(payload: bytes) -> ParamsRequest:
     return ParamsRequest(query.lower, query.upper, query.deadline_ms)
 
 
-def decode_atoms_query(payload: bytes) -> str | None:
-    """The atom that is asked for; None asks for the list."""
-    return _decode(payload, messages.AtomsQuery).atom_id
+def decode_atoms_query(payload: bytes, limits: Limits) -> AtomsRequest:
+    """What is asked of the dictionary.
+
+    Raises:
+        BadMessageError: not this message, or its fields do not fit its action.
+        TooLargeError, ShapeError, BadPointsError, EmptyError: of the atom to be added.
+    """
+    query = _decode(payload, messages.AtomsQuery, limits.max_query_bytes)
+    action = messages.AtomsAction.READ if query.action is messages.ABSENT else query.action
+    if action is messages.AtomsAction.ADD:
+        if query.atom is messages.ABSENT or query.atom_id not in (None, query.atom.info.atom_id):
+            raise BadMessageError(
+                "pot.atoms_query.v1: to add needs the field `atom`, and no other id beside it"
+            )
+        return AtomsRequest(action, None, decode_atom(query.atom, max_points=limits.max_query_points))
+    if query.atom is not messages.ABSENT:
+        raise BadMessageError(f"pot.atoms_query.v1: to {action.value} takes no field `atom`")
+    if action is messages.AtomsAction.REMOVE and query.atom_id is None:
+        raise BadMessageError("pot.atoms_query.v1: to remove needs the field `atom_id`")
+    return AtomsRequest(action, query.atom_id, None)
+
+
+@np.errstate(over="ignore", invalid="ignore")
+def decode_atom(message: messages.Atom, *, max_points: int) -> Atom:
+    """An atom of the dictionary; the scalars beside its kernels belong to maps, and are left out.
+
+    Raises:
+        ShapeError: an array has the wrong dtype, shape or byte count, or a number its sign does not allow.
+        TooLargeError: more points or kernels than a query may have.
+        BadPointsError, EmptyError: NaN or infinite points, or none.
+    """
+    info, kernels = message.info, message.kernels
+    hits, free = (
+        _decode_array(array, name, _FLOATS, (None, 3))
+        for name, array in (("hit_points", message.hit_points), ("free_points", message.free_points))
+    )
+    hinges = _decode_array(kernels.hinge_mean, "hinge_mean", _FLOATS, (None, 3))
+    for name, n, counted in (
+        ("hits", len(hits), info.n_hits),
+        ("free", len(free), info.n_free),
+        ("kernels", len(hinges), info.n_kernels),
+    ):
+        if n > max_points:
+            raise TooLargeError(f"atom with {n} {name}, the limit is {max_points}")
+        if n != counted:
+            raise ShapeError(f"atom: its arrays have {n} {name}, its info says {counted}")
+    k = len(hinges)
+
+    def numbers(name: str, shape: tuple[int, ...]) -> NDArray[np.float32]:
+        return np.asarray(_decode_array(getattr(kernels, name), name, _FLOATS, shape), np.float32)
+
+    return Atom(
+        atom_id=info.atom_id,
+        dims=info.dims,
+        hit_points=np.asarray(hits, np.float32),
+        free_points=np.asarray(free, np.float32),
+        kernels=KernelSet(
+            hinge_mean=np.asarray(kernels.origin) + hinges,
+            hinge_var=numbers("hinge_var", (k, 3)),
+            **{
+                name: numbers(name, (k,))
+                for name in ("gamma_shape", "gamma_rate", "weight_mean", "weight_var")
+            },
+        ),
+        radius_m=float(info.radius_m),
+        azimuth_width_rad=float(info.azimuth_width_rad),
+        provenance=dict(info.provenance),
+    )
+
+
+def read_atom_file(payload: bytes) -> Atom:
+    """The atom in a `*.atom` file, which is the message `pot.atom.v1`.
+
+    Raises:
+        BadMessageError and what `decode_atom` raises.
+    """
+    limits = Limits()
+    message = _decode(payload, messages.Atom, limits.max_query_bytes)
+    return decode_atom(message, max_points=limits.max_query_points)
 
 
 def decode_info_query(payload: bytes) -> None:
@@ -472,12 +638,46 @@ def encode_kernels(kernels: KernelSet, rule: AnswerRule) -> messages.Kernels:
         observed_activation=float(rule.observed_activation),
         prior_var=float(rule.prior_var),
         residual_var=float(rule.residual_var),
+        mean_moderation=float(rule.mean_moderation),
     )
 
 
 def encode_occupancy(occupancy: Occupancy) -> Wire:
     """The reply to `q/points`."""
     return _wire(_occupancy(occupancy))
+
+
+def encode_rays(rays: RayReturns) -> Wire:
+    """The reply to `q/rays`."""
+    return _wire(
+        messages.Rays(
+            hit_probability=_float32(rays.hit_probability),
+            mean_m=_float32(rays.mean_m),
+            std_m=_float32(rays.std_m),
+            quantile_m=_float32(rays.quantile_m),
+            unknown_range_m=_float32(rays.unknown_range_m),
+            unknown_share=_float32(rays.unknown_share),
+            step_m=rays.step_m,
+            map_revision=rays.map_revision,
+        )
+    )
+
+
+def encode_risk(risk: PathRisk) -> Wire:
+    """The reply to `q/risk`."""
+    return _wire(
+        messages.Risk(
+            max_probability=_float32(risk.max_probability),
+            union_probability=_float32(risk.union_probability),
+            unknown_share=_float32(risk.unknown_share),
+            path_max_probability=risk.path_max_probability,
+            path_union_probability=risk.path_union_probability,
+            path_unknown_share=risk.path_unknown_share,
+            n_cells=risk.n_cells,
+            resolution_m=risk.resolution_m,
+            map_revision=risk.map_revision,
+        )
+    )
 
 
 def encode_grid_part(
@@ -523,7 +723,7 @@ def encode_params_part(
     )
 
 
-def encode_atom_list(atoms: Sequence[Atom], usage: Mapping[str, int]) -> Wire:
+def encode_atom_list(atoms: Iterable[Atom], usage: Mapping[str, int]) -> Wire:
     """The dictionary's table."""
     return _wire(messages.AtomList(atoms=[_atom_info(atom, usage) for atom in atoms]))
 
@@ -537,6 +737,13 @@ def encode_atom(atom: Atom, usage: Mapping[str, int], rule: AnswerRule) -> Wire:
             free_points=_float32(atom.free_points),
             kernels=encode_kernels(atom.kernels, rule),
         )
+    )
+
+
+def encode_atoms_changed(change: AtomChange) -> Wire:
+    """The reply to an atom added or removed."""
+    return _wire(
+        messages.AtomsChanged(atom_id=change.atom_id, n_atoms=change.n_atoms, persisted=change.persisted)
     )
 
 
@@ -574,6 +781,7 @@ def encode_info(
             observed_activation=float(snapshot.rule.observed_activation),
             prior_var=float(snapshot.rule.prior_var),
             residual_var=float(snapshot.rule.residual_var),
+            mean_moderation=float(snapshot.rule.mean_moderation),
             limits=messages.Limits(
                 max_cloud_bytes=limits.max_cloud_bytes,
                 max_cloud_points=limits.max_cloud_points,
@@ -582,6 +790,10 @@ def encode_info(
                 max_grid_cells=limits.max_grid_cells,
                 max_range_m=float(max_range_m),
                 max_coordinate_m=limits.max_coordinate_m,
+                max_query_rays=limits.max_query_rays,
+                max_query_poses=limits.max_query_poses,
+                max_query_spheres=limits.max_query_spheres,
+                max_query_samples=limits.max_query_samples,
             ),
             started_ns=started_ns,
         )
@@ -638,6 +850,7 @@ def encode_error(error: PotserverError) -> Wire:
             message=str(error),
             retryable=error.retryable,
             retry_after_s=error.retry_after_s,
+            reason=messages.ABSENT if error.reason is None else error.reason,
         )
     )
 
@@ -664,6 +877,10 @@ def _occupancy(occupancy: Occupancy) -> messages.Occupancy:
         latent_var=_float32(occupancy.latent_var),
         observed=wire.encode_array(occupancy.observed),
         map_revision=occupancy.map_revision,
+        gradient=messages.ABSENT if occupancy.gradient is None else _float32(occupancy.gradient),
+        latent_gradient=(
+            messages.ABSENT if occupancy.latent_gradient is None else _float32(occupancy.latent_gradient)
+        ),
     )
 
 

@@ -2,13 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from potserver.domain.types import AnswerRule, Atom, KernelSet, MapUpdate, Occupancy, Scan
+from potserver.domain.dictionary import AtomDictionary
+from potserver.domain.types import (
+    AnswerRule,
+    KernelSet,
+    MapUpdate,
+    Occupancy,
+    PathRisk,
+    RayReturns,
+    Scan,
+    Unknown,
+)
 from potserver.services.settings import MappingSettings
 
 
@@ -31,20 +41,13 @@ class Snapshot(Protocol):
     def __len__(self) -> int: ...
 
 
-class Atoms(Protocol):
-    """The dictionary."""
-
-    def get(self, atom_id: str) -> Atom: ...
-    def __len__(self) -> int: ...
-    def __iter__(self) -> Iterator[Atom]: ...
-
-
 class Mapper(Protocol):
     """The one writer of a map, and its readable state."""
 
     def integrate(self, scan: Scan) -> MapUpdate: ...
     def clear(self) -> None: ...
     def warm_up(self) -> None: ...
+    def use_dictionary(self, dictionary: AtomDictionary) -> None: ...
     @property
     def snapshot(self) -> Snapshot: ...
     @property
@@ -52,7 +55,7 @@ class Mapper(Protocol):
     @property
     def atom_usage(self) -> Mapping[str, int]: ...
     @property
-    def dictionary(self) -> Atoms: ...
+    def dictionary(self) -> AtomDictionary: ...
     @property
     def settings(self) -> MappingSettings: ...
 
@@ -67,10 +70,50 @@ class GridPlan(Protocol):
     def part(self, index: int) -> tuple[int, Occupancy]: ...
 
 
+class RayPlan(Protocol):
+    """A query of rays that passed its checks; all parts come from one snapshot."""
+
+    @property
+    def n_parts(self) -> int: ...
+    def part(self, i: int) -> Any: ...
+    def result(self, parts: Iterable[Any]) -> RayReturns: ...
+
+
+class RiskPlan(Protocol):
+    """A query of risk that passed its checks; all parts come from one snapshot."""
+
+    @property
+    def n_parts(self) -> int: ...
+    def part(self, i: int) -> Any: ...
+    def result(self, parts: Iterable[Any]) -> PathRisk: ...
+
+
 class Asker(Protocol):
     """The read side of a map."""
 
-    def occupancy(self, points: NDArray[np.floating[Any]]) -> Occupancy: ...
+    def warm_up(self) -> None: ...
+    def occupancy(self, points: NDArray[np.floating[Any]], *, with_gradient: bool = False) -> Occupancy: ...
+    def rays(
+        self,
+        origins: NDArray[np.floating[Any]],
+        directions: NDArray[np.floating[Any]],
+        max_range_m: float,
+        *,
+        quantiles: Sequence[float],
+        unknown: Unknown,
+        width_m: float | None,
+        step_m: float | None,
+    ) -> RayPlan: ...
+    def risk(
+        self,
+        path: NDArray[np.floating[Any]],
+        spheres: NDArray[np.floating[Any]],
+        *,
+        unknown: Unknown,
+        resolution_m: float | None,
+        correlation_m: float | None,
+        dims: int,
+    ) -> RiskPlan: ...
     def grid(
         self, lower: Sequence[float], upper: Sequence[float], resolution: float, *, part_cells: int
     ) -> GridPlan: ...

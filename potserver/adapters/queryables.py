@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import time
 from collections.abc import Callable, Iterator
+from typing import Any
 
 import numpy as np
 import zenoh
@@ -21,16 +22,20 @@ from potserver.adapters.key_exprs import is_wild
 from potserver.adapters.limits import Limits
 from potserver.adapters.log import get_logger
 from potserver.adapters.outbox import Outbox
-from potserver.adapters.ports import Asker, Mapper
+from potserver.adapters.ports import Asker, Mapper, RayPlan, RiskPlan
 from potserver.adapters.query_pool import QueryJob, QueryPool
 from potserver.adapters.receipts import ReceiptSender
 from potserver.errors import DeadlineError, PotserverError, ShuttingDownError, UnsupportedError
+from potserver.services.atom_store import AtomChange, AtomStore
 from potserver.services.health import Health
 
 log = get_logger("potserver.queries")
 
 INTEGRATE = "integrate"
-_SHORT = ("atoms", "info")  # answered past the grids that wait
+_SHORT = (
+    "atoms",
+    "info",
+)  # answered past the grids that wait; a change of the atoms is rare, and short beside a grid
 _BACKLOG = 64  # queries between Zenoh and our admission; admission takes microseconds
 _BUG = "a bug of the server; the traceback is in its log"
 
@@ -45,6 +50,7 @@ class MapQueryable:
         *,
         mapper: Mapper,
         asker: Asker,
+        atoms: AtomStore,
         intake: IntakeQueue,
         receipts: ReceiptSender,
         pool: QueryPool,
@@ -55,7 +61,7 @@ class MapQueryable:
         encode_info: Callable[[], codec.Wire],
     ) -> None:
         self._keys = map_keys
-        self._mapper, self._asker = mapper, asker
+        self._mapper, self._asker, self._atom_store = mapper, asker, atoms
         self._intake, self._receipts, self._pool = intake, receipts, pool
         self._health, self._limits = health, limits
         self._grid_part_cells, self._params_part_kernels = grid_part_cells, params_part_kernels
@@ -65,6 +71,8 @@ class MapQueryable:
         ] = {
             "points": (messages.PointsQuery, self._points),
             "grid": (messages.GridQuery, self._grid),
+            "rays": (messages.RaysQuery, self._rays),
+            "risk": (messages.RiskQuery, self._risk),
             "params": (messages.ParamsQuery, self._params),
             "atoms": (messages.AtomsQuery, self._atoms),
             "info": (messages.InfoQuery, self._info),
@@ -160,7 +168,9 @@ class MapQueryable:
     def _points(self, payload: bytes, arrived_s: float) -> Iterator[codec.Wire]:
         request = codec.decode_points_query(payload, self._limits)
         _check_deadline(arrived_s, request.deadline_ms)
-        yield codec.encode_occupancy(self._asker.occupancy(request.points))
+        yield codec.encode_occupancy(
+            self._asker.occupancy(request.points, with_gradient=request.with_gradient)
+        )
 
     def _grid(self, payload: bytes, arrived_s: float) -> Iterator[codec.Wire]:
         request = codec.decode_grid_query(payload)
@@ -180,6 +190,39 @@ class MapQueryable:
                 resolution=request.resolution,
                 occupancy=occupancy,
             )
+
+    def _rays(self, payload: bytes, arrived_s: float) -> Iterator[codec.Wire]:
+        request = codec.decode_rays_query(payload, self._limits)
+        _check_deadline(arrived_s, request.deadline_ms)
+        plan = self._asker.rays(
+            request.origins,
+            request.directions,
+            request.max_range_m,
+            quantiles=request.quantiles,
+            unknown=request.unknown,
+            width_m=request.width_m,
+            step_m=request.step_m,
+        )
+        yield codec.encode_rays(plan.result(self._parts(plan, arrived_s, request.deadline_ms)))
+
+    def _risk(self, payload: bytes, arrived_s: float) -> Iterator[codec.Wire]:
+        request = codec.decode_risk_query(payload, self._limits)
+        _check_deadline(arrived_s, request.deadline_ms)
+        plan = self._asker.risk(
+            request.path,
+            request.spheres,
+            unknown=request.unknown,
+            resolution_m=request.resolution_m,
+            correlation_m=request.correlation_m,
+            dims=request.dims,
+        )
+        yield codec.encode_risk(plan.result(self._parts(plan, arrived_s, request.deadline_ms)))
+
+    def _parts(self, plan: RayPlan | RiskPlan, arrived_s: float, deadline_ms: float | None) -> Iterator[Any]:
+        """The parts of an answer that goes out whole."""
+        for part in range(plan.n_parts):
+            self._check_may_go_on(arrived_s, deadline_ms)
+            yield plan.part(part)
 
     def _params(self, payload: bytes, arrived_s: float) -> Iterator[codec.Wire]:
         request = codec.decode_params_query(payload)
@@ -210,17 +253,27 @@ class MapQueryable:
             raise ShuttingDownError("the server is closing")
 
     def _atoms(self, payload: bytes, _arrived_s: float) -> Iterator[codec.Wire]:
-        atom_id = codec.decode_atoms_query(payload)
+        request = codec.decode_atoms_query(payload, self._limits)
         dictionary, usage = self._mapper.dictionary, self._mapper.atom_usage
-        if atom_id is None:
-            yield codec.encode_atom_list(list(dictionary), usage)
+        if request.action is not messages.AtomsAction.READ:
+            yield codec.encode_atoms_changed(self._change_atoms(request))
+        elif request.atom_id is None:
+            yield codec.encode_atom_list(dictionary, usage)
         else:
-            snapshot = self._mapper.snapshot
-            yield codec.encode_atom(
-                dictionary.get(atom_id),
-                usage,
-                snapshot.rule,
-            )
+            yield codec.encode_atom(dictionary.get(request.atom_id), usage, self._mapper.snapshot.rule)
+
+    def _change_atoms(self, request: codec.AtomsRequest) -> AtomChange:
+        try:
+            if request.atom is not None:
+                change, verb = self._atom_store.add(request.atom), "added"
+            else:
+                change, verb = self._atom_store.remove(str(request.atom_id)), "removed"
+        except PotserverError as error:
+            self._health.count(f"atoms.refused.{error.reason or error.code}")
+            raise
+        self._health.count(f"atoms.{verb}")
+        log.info(f"atom_{verb}", atom_id=change.atom_id, n_atoms=change.n_atoms, persisted=change.persisted)
+        return change
 
     def _info(self, payload: bytes, _arrived_s: float) -> Iterator[codec.Wire]:
         codec.decode_info_query(payload)

@@ -1,46 +1,50 @@
-"""AtomDictionary: the atoms that scans are matched against, and the file they live in."""
+"""AtomDictionary: the atoms that scans are matched against."""
 
 from __future__ import annotations
 
-import dataclasses
-import io
-import json
-import zipfile
-import zlib
-from collections.abc import Iterator
+import os
+from collections.abc import Iterable, Iterator
 from importlib import resources
 from pathlib import Path
 
-import numpy as np
-
-from potserver.domain.types import Atom, KernelSet
-from potserver.errors import BadPointsError, DictionaryError, EmptyError, ShapeError, UnknownAtomError
-
-FORMAT = "potserver-atoms"
-FORMAT_VERSION = 1
-_POINT_SETS = ("hit_points", "free_points")
-_KERNEL_ARRAYS = tuple(f.name for f in dataclasses.fields(KernelSet))
+from potserver.domain.atom_file import AtomFile, open_atoms, write_atoms
+from potserver.domain.types import Atom
+from potserver.errors import DictionaryError, UnknownAtomError
 
 
 class AtomDictionary:
-    """An ordered set of atoms with unique ids. Immutable."""
+    """An ordered set of atoms with unique ids. Immutable: a change gives another dictionary.
 
-    def __init__(self, atoms: tuple[Atom, ...]) -> None:
+    Atoms of a file stay in it until they are asked for, so that thousands of them open at once.
+    """
+
+    def __init__(self, atoms: Iterable[Atom] = ()) -> None:
         """Hold atoms.
 
         Raises:
             DictionaryError: two atoms have one id.
         """
-        self.atoms = tuple(atoms)
-        self._by_id = {atom.atom_id: atom for atom in self.atoms}
-        if len(self._by_id) != len(self.atoms):
-            raise DictionaryError("two atoms have the same id")
+        self._slots = _by_id(atoms)
+
+    @classmethod
+    def _of(cls, slots: Iterable[Atom | _StoredAtom]) -> AtomDictionary:
+        dictionary = cls()
+        dictionary._slots = _by_id(slots)
+        return dictionary
 
     def __len__(self) -> int:
-        return len(self.atoms)
+        return len(self._slots)
 
     def __iter__(self) -> Iterator[Atom]:
-        return iter(self.atoms)
+        return (_open(slot) for slot in self._slots.values())
+
+    def __contains__(self, atom_id: object) -> bool:
+        return atom_id in self._slots
+
+    @property
+    def atoms(self) -> tuple[Atom, ...]:
+        """All atoms, in order."""
+        return tuple(self)
 
     def get(self, atom_id: str) -> Atom:
         """One atom.
@@ -48,92 +52,85 @@ class AtomDictionary:
         Raises:
             UnknownAtomError: there is none of that id.
         """
-        try:
-            return self._by_id[atom_id]
-        except KeyError:
-            raise UnknownAtomError(f"no atom {atom_id!r}; the dictionary holds {len(self)} atoms") from None
+        return _open(self._slot(atom_id))
 
     def of_dims(self, dims: int) -> AtomDictionary:
         """The atoms learned in 2 or in 3 dimensions."""
-        return AtomDictionary(tuple(a for a in self.atoms if a.dims == dims))
+        return AtomDictionary._of(slot for slot in self._slots.values() if slot.dims == dims)
+
+    def add(self, atom: Atom) -> AtomDictionary:
+        """These atoms and one more, at the end.
+
+        Raises:
+            DictionaryError: its id is taken.
+        """
+        return AtomDictionary._of([*self._slots.values(), atom])
+
+    def remove(self, atom_id: str) -> AtomDictionary:
+        """These atoms without one.
+
+        Raises:
+            UnknownAtomError: there is none of that id.
+        """
+        leaving = self._slot(atom_id)
+        return AtomDictionary._of(slot for slot in self._slots.values() if slot is not leaving)
 
     @staticmethod
     def builtin() -> AtomDictionary:
         """The atoms that the package ships, 2D and 3D."""
-        with resources.as_file(resources.files("potserver") / "data" / "atoms.npz") as path:
+        with resources.as_file(resources.files("potserver") / "data" / "builtin.atoms") as path:
             return AtomDictionary.load(path)
 
-    def save(self, path: str | Path) -> None:
-        """Write the file whole or not at all. The same atoms give the same bytes."""
-        arrays: dict[str, np.ndarray] = {}
-        header = {"format": FORMAT, "version": FORMAT_VERSION, "atoms": []}
-        for i, atom in enumerate(self.atoms):
-            entry = {
-                k: getattr(atom, k)
-                for k in ("atom_id", "dims", "radius_m", "azimuth_width_rad", "provenance")
-            }
-            header["atoms"].append(entry)  # type: ignore[attr-defined]
-            arrays |= {f"{i}.{name}": getattr(atom, name) for name in _POINT_SETS}
-            arrays |= {f"{i}.{name}": getattr(atom.kernels, name) for name in _KERNEL_ARRAYS}
-        arrays["header"] = np.frombuffer(json.dumps(header, sort_keys=True).encode(), np.uint8)
-        target = Path(path)
-        partial = target.with_name(target.name + ".partial")
-        with zipfile.ZipFile(partial, "w", zipfile.ZIP_DEFLATED, compresslevel=9) as archive:
-            for name in sorted(arrays):
-                buffer = io.BytesIO()
-                np.lib.format.write_array(buffer, np.ascontiguousarray(arrays[name]), allow_pickle=False)
-                # a fixed date: the file depends on the atoms alone
-                archive.writestr(
-                    zipfile.ZipInfo(f"{name}.npy", (1980, 1, 1, 0, 0, 0)),
-                    buffer.getvalue(),
-                    zipfile.ZIP_DEFLATED,
-                    9,
-                )
-        partial.replace(target)
-
-    @staticmethod
-    def load(path: str | Path) -> AtomDictionary:
-        """Read a dictionary file; it never executes anything (no pickle).
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write a file, whole or not at all; the same atoms give the same bytes. Kernels' positions become float32.
 
         Raises:
-            DictionaryError: missing, damaged (every member has a checksum), or of another format or version.
+            DictionaryError: the disk refuses.
         """
+        write_atoms(Path(path), self.atoms)
+
+    @staticmethod
+    def load(path: str | os.PathLike[str], *, verify: bool = True) -> AtomDictionary:
+        """Open a file; it never executes anything. While its atoms are in use it may be replaced, but not overwritten.
+
+        Args:
+            path: What `save` wrote.
+            verify: Read all of it once and compare its SHA-256; false trusts the disk, and reads only what is used.
+        Raises:
+            DictionaryError: missing, truncated, damaged, or of another format or version; the message says which.
+        """
+        file = open_atoms(Path(path), verify=verify)
+        return AtomDictionary._of(_StoredAtom(file, number) for number in range(len(file.records)))
+
+    def _slot(self, atom_id: str) -> Atom | _StoredAtom:
         try:
-            # opened here, because numpy leaves the file of a damaged archive open
-            with Path(path).open("rb") as stream, np.load(stream, allow_pickle=False) as file:
-                arrays = {name: file[name] for name in file.files}
-            header = json.loads(arrays["header"].tobytes())
-        except FileNotFoundError:
-            raise DictionaryError(f"no atom dictionary at {path}") from None
-        except (
-            OSError,
-            EOFError,
-            ValueError,
-            KeyError,
-            RuntimeError,
-            zipfile.BadZipFile,
-            zlib.error,
-        ) as error:
-            raise DictionaryError(f"{path} is not an atom dictionary, or is damaged: {error}") from error
-        if not isinstance(header, dict):
-            raise DictionaryError(
-                f"{path} is not an atom dictionary: its header is a {type(header).__name__}"
-            )
-        if header.get("format") != FORMAT or header.get("version") != FORMAT_VERSION:
-            raise DictionaryError(
-                f"{path}: format {header.get('format')!r} version {header.get('version')!r},"
-                f" this program reads {FORMAT!r} version {FORMAT_VERSION}"
-            )
-        try:
-            return AtomDictionary(
-                tuple(
-                    Atom(
-                        **entry,
-                        **{name: arrays[f"{i}.{name}"] for name in _POINT_SETS},
-                        kernels=KernelSet(**{name: arrays[f"{i}.{name}"] for name in _KERNEL_ARRAYS}),
-                    )
-                    for i, entry in enumerate(header["atoms"])
-                )
-            )
-        except (KeyError, TypeError, ShapeError, BadPointsError, EmptyError) as error:
-            raise DictionaryError(f"{path}: an atom is incomplete: {error}") from error
+            return self._slots[atom_id]
+        except KeyError:
+            raise UnknownAtomError(f"no atom {atom_id!r}; the dictionary holds {len(self)} atoms") from None
+
+
+class _StoredAtom:
+    """An atom that stays in its file until it is asked for."""
+
+    def __init__(self, file: AtomFile, number: int) -> None:
+        self.atom_id, self.dims = file.records[number].atom_id, file.records[number].dims
+        self._file, self._number = file, number
+        self._atom: Atom | None = None
+
+    def open(self) -> Atom:
+        if self._atom is None:  # two threads may both do it: they get equal atoms
+            self._atom = self._file.atom(self._number)
+        return self._atom
+
+
+def _open(slot: Atom | _StoredAtom) -> Atom:
+    return slot.open() if isinstance(slot, _StoredAtom) else slot
+
+
+def _by_id(slots: Iterable[Atom | _StoredAtom]) -> dict[str, Atom | _StoredAtom]:
+    by_id: dict[str, Atom | _StoredAtom] = {}
+    for slot in slots:
+        if slot.atom_id in by_id:
+            raise DictionaryError(f"two atoms have the id {slot.atom_id!r}")
+        by_id[slot.atom_id] = slot
+    return by_id

@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import dataclasses
+import math
+from collections.abc import Sequence
+from functools import cached_property
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import ArrayLike
 
-from potserver.domain.types import AnswerRule, Float32, Float64, KernelSet, Occupancy
+from potserver.domain.types import AnswerRule, Float32, Float64, KernelSet, Occupancy, Unknown
 from potserver.errors import BadPointsError, ShapeError
-from potserver.numerics import kernel_index
+from potserver.numerics import gradients, kernel_index, rays
 from potserver.numerics.occupancy import predict_occupancy
 from potserver.numerics.threads import default_threads
 
@@ -17,42 +23,68 @@ OBSERVED_ACTIVATION = 0.05
 PRIOR_VAR = 50.0
 
 
-class KernelMap:
-    """K kernels and the index that makes asking them fast. Never changes; any number of threads may query it at once."""
+class IndexedKernels(NamedTuple):
+    """Kernels in the map frame with the index that makes asking them fast."""
 
-    def __init__(
-        self,
-        kernels: KernelSet,
-        *,
-        observed_activation: float = OBSERVED_ACTIVATION,
-        prior_var: float = PRIOR_VAR,
-        residual_var: float = 0.0,
-        map_revision: int = 0,
-        threads: int | None = None,
-    ) -> None:
-        """Index the kernels. Answers use the mean of every hinge and every gamma; their dispersions are only kept.
+    kernels: KernelSet
+    lookup: kernel_index.KernelIndex
 
-        Args:
-            kernels: In the map frame; gamma enters by its mean.
-            observed_activation: Points with a smaller activation sum answer 0.5, `prior_var`, and `observed` false.
-            prior_var: Latent variance of unobserved points, log-odds^2.
-            residual_var: What the kernels cannot know, log-odds^2: it is added to the latent variance in the measure that the
-                activation falls short of 1, so that certainty fades with the kernels. 0 is the paper's model, which is *surer*
-                the farther it is from all data.
-            map_revision: Carried into the answers.
-            threads: Threads a query may use; all processors by default.
-        """
-        self.kernels = kernels
-        self.rule = AnswerRule(observed_activation, prior_var, residual_var)
-        self.map_revision = map_revision
-        self._threads = threads or default_threads()
-        self._index = kernel_index.build_index(
+    @staticmethod
+    def of(kernels: KernelSet, observed_activation: float) -> IndexedKernels:
+        """Index kernels for maps with this `observed_activation`."""
+        lookup = kernel_index.build_index(
             kernels.hinge_mean,
             kernels.gamma,
             kernels.weight_mean,
             kernels.weight_var,
             activation_cut=observed_activation / 20.0,
         )
+        return IndexedKernels(kernels, lookup)
+
+
+class KernelMap:
+    """K kernels and the index that makes asking them fast. Never changes; any number of threads may query it at once."""
+
+    def __init__(
+        self,
+        kernels: KernelSet | Sequence[IndexedKernels],
+        *,
+        observed_activation: float = OBSERVED_ACTIVATION,
+        prior_var: float = PRIOR_VAR,
+        residual_var: float = 0.0,
+        mean_moderation: float = 1.0,
+        map_revision: int = 0,
+        threads: int | None = None,
+    ) -> None:
+        """Index the kernels. Answers use the mean of every hinge and every gamma; their dispersions are only kept.
+
+        Args:
+            kernels: In the map frame; gamma enters by its mean. Or parts of them that were indexed before, at this
+                `observed_activation`: then only what is new about the map has to be built.
+            observed_activation: Points with a smaller activation sum answer 0.5, `prior_var`, and `observed` false.
+            prior_var: Latent variance of unobserved points, log-odds^2.
+            residual_var: What the kernels cannot know, log-odds^2: it is added to the latent variance in the measure that the
+                activation falls short of 1, so that certainty fades with the kernels. 0 is the paper's model, which is *surer*
+                the farther it is from all data.
+            mean_moderation: Share of the latent variance that pulls the mean towards 0.5; 1 is the paper's model. The variances
+                are of single weights, and what neighbours have in common is in none of them: 1 makes a map timid.
+            map_revision: Carried into the answers.
+            threads: Threads a query may use; all processors by default.
+        """
+        self.rule = AnswerRule(observed_activation, prior_var, residual_var, mean_moderation)
+        self.map_revision = map_revision
+        self._threads = threads or default_threads()
+        if isinstance(kernels, KernelSet):
+            kernels = [IndexedKernels.of(kernels, observed_activation)]
+        self._parts = tuple(kernels)
+        self._index = kernel_index.IndexParts.of([part.lookup for part in self._parts])
+
+    @cached_property
+    def kernels(self) -> KernelSet:
+        """All kernels, map frame; put together when first asked for."""
+        if len(self._parts) == 1:
+            return self._parts[0].kernels
+        return KernelSet.concatenate([part.kernels for part in self._parts])
 
     @classmethod
     def from_arrays(
@@ -65,6 +97,7 @@ class KernelMap:
         observed_activation: float = OBSERVED_ACTIVATION,
         prior_var: float = PRIOR_VAR,
         residual_var: float = 0.0,
+        mean_moderation: float = 1.0,
         threads: int | None = None,
     ) -> KernelMap:
         """A map from bare arrays, hinges and gammas without dispersion.
@@ -74,7 +107,7 @@ class KernelMap:
             gamma: (K,) 1/m^2, > 0.
             weight_mean: (K,) log-odds.
             weight_var: (K,) log-odds^2, >= 0; a variance, not a standard deviation.
-            observed_activation, prior_var, residual_var, threads: As in the constructor.
+            observed_activation, prior_var, residual_var, mean_moderation, threads: As in the constructor.
         Raises:
             ShapeError: the arrays disagree on K, or gamma or a variance has an illegal sign, or something is not finite.
         """
@@ -101,11 +134,12 @@ class KernelMap:
             observed_activation=observed_activation,
             prior_var=prior_var,
             residual_var=residual_var,
+            mean_moderation=mean_moderation,
             threads=threads,
         )
 
     def __len__(self) -> int:
-        return len(self.kernels)
+        return sum(len(part.kernels) for part in self._parts)
 
     def occupancy(self, points: ArrayLike) -> Occupancy:
         """Mean and variance of the occupancy probability, and of the latent, anywhere.
@@ -128,7 +162,9 @@ class KernelMap:
             np.float32(self.rule.prior_var),
         )
         # float64: in float32 a sure answer would round to exactly 1 and cost an infinite log-loss when wrong
-        mean, var = predict_occupancy(latent_mean.astype(np.float64), latent_var.astype(np.float64))
+        mean, var = predict_occupancy(
+            latent_mean.astype(np.float64), latent_var.astype(np.float64), self.rule.mean_moderation
+        )
         return Occupancy(
             mean=np.asarray(mean, np.float64),
             var=np.asarray(var, np.float64),
@@ -138,9 +174,92 @@ class KernelMap:
             map_revision=self.map_revision,
         )
 
+    def occupancy_with_gradient(self, points: ArrayLike) -> Occupancy:
+        """`occupancy` and the analytic gradients of its mean and of its latent mean; both are 0 where nothing was observed.
+
+        Args, Raises: As `occupancy`.
+        """
+        array = as_points(points)
+        answer = self.occupancy(array)
+        slopes = gradients.latent_gradients(self._whole, array, threads=self._threads, lane="query")
+        activation = self.latent(array).activation
+        # the residual variance falls only where it is there: below an activation of 1
+        residual = np.where(activation < 1.0, self.rule.residual_var, 0.0)
+        var_gradient = slopes.var - residual[:, None] * slopes.activation
+        known = answer.observed[:, None]
+        mean_gradient = gradients.occupancy_gradient(
+            answer.latent_mean, answer.latent_var, slopes.mean, var_gradient, self.rule.mean_moderation
+        )
+        return dataclasses.replace(
+            answer,
+            gradient=np.where(known, mean_gradient, 0.0),
+            latent_gradient=np.where(known, slopes.mean, 0.0).astype(np.float64),
+        )
+
+    def first_returns(
+        self,
+        origins: Float64,
+        directions: Float64,
+        max_range_m: Float64,
+        *,
+        step_m: float,
+        quantiles: Float64,
+        unknown: Unknown,
+        width_m: float | None,
+    ) -> rays.FirstReturns:
+        """Where rays end, see `numerics.rays`; inputs are checked by `QueryService.rays`."""
+        width_of_unknown = self.typical_width_m if width_m is None else width_m
+        rate = {
+            Unknown.FREE: 0.0,
+            Unknown.PRIOR: math.log(2.0) / width_of_unknown,
+            Unknown.OCCUPIED: math.inf,
+        }
+        return rays.first_returns(
+            self._whole,
+            origins,
+            directions,
+            max_range_m,
+            step_m=step_m,
+            quantiles=quantiles,
+            unknown_rate=rate[unknown],
+            width_m=width_m,
+            observed_activation=self.rule.observed_activation,
+            residual_var=self.rule.residual_var,
+            mean_moderation=self.rule.mean_moderation,
+            threads=self._threads,
+        )
+
+    @cached_property
+    def _whole(self) -> kernel_index.KernelIndex:
+        """One index of all kernels, for questions that walk through the parts; built by the first of them."""
+        if len(self._parts) == 1:
+            return self._parts[0].lookup
+        return IndexedKernels.of(self.kernels, self.rule.observed_activation).lookup
+
+    @cached_property
+    def typical_width_m(self) -> float:
+        """Median over the kernels of sqrt(pi / (2 gamma)): what counts as one trial where nothing was observed."""
+        return rays.typical_width(self._whole)
+
+    @cached_property
+    def fine_step_m(self) -> float:
+        """A step that resolves nearly all kernels along a ray."""
+        return rays.fine_step(self._whole)
+
+    def widths(self, points: Float64) -> Float64:
+        """(N,) m: mean of sqrt(pi / (2 gamma)) of the kernels at (N, 3) points, by activation; `typical_width_m` if none."""
+        columns = self._whole.columns.copy()
+        columns[1], columns[2] = rays.kernel_widths(self._whole), 0.0
+        weighted = kernel_index.latent_sums(
+            self._whole._replace(columns=columns), points, threads=self._threads, lane="query"
+        )
+        reached = weighted.activation > 0
+        mean = weighted.mean / np.where(reached, weighted.activation, np.float32(1))
+        return np.where(reached, mean.astype(np.float64), self.typical_width_m)
+
     def latent(self, points: Float64) -> kernel_index.LatentSums:
         """The bare sums of eq. 1 at (N, 3) points, with no rule for unobserved ones."""
-        return kernel_index.latent_sums(self._index, points, threads=self._threads, lane="query")
+        return kernel_index.latent_sums_of_parts(self._index, points, threads=self._threads, lane="query")
 
 
 def as_points(points: ArrayLike) -> Float64:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from enum import Enum
 from typing import NamedTuple
 
 import numpy as np
@@ -144,6 +145,10 @@ class KernelSet:
         """A copy with some arrays exchanged."""
         return dataclasses.replace(self, **arrays)  # type: ignore[arg-type]
 
+    def moved(self, by_m: Float64) -> KernelSet:
+        """The same kernels in a frame whose origin lies at -`by_m`, (3,) m, of this one."""
+        return self.replace(hinge_mean=self.hinge_mean + by_m)
+
     @staticmethod
     def concatenate(sets: list[KernelSet]) -> KernelSet:
         """One set of all kernels, in order; no sets give the empty set."""
@@ -231,6 +236,7 @@ class AnswerRule(NamedTuple):
     observed_activation: float  # a point with less summed activation is unobserved
     prior_var: float  # log-odds^2, latent variance of unobserved points
     residual_var: float  # log-odds^2, added in the measure that the activation falls short of 1
+    mean_moderation: float = 1.0  # share of the latent variance that pulls the mean towards 0.5
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -243,6 +249,49 @@ class Occupancy:
     latent_var: Float32  # (N,) log-odds^2
     observed: Bool  # (N,) false = no kernel near: unknown, not free
     map_revision: int = 0
+    gradient: Float64 | None = None  # (N, 3) 1/m, of `mean`; 0 where unobserved; none unless asked for
+    latent_gradient: Float64 | None = None  # (N, 3) log-odds/m, of `latent_mean`; likewise
+
+
+class Unknown(str, Enum):
+    """What rays and robots take unobserved space for."""
+
+    OCCUPIED = "occupied"  # it stops a ray, and touching it is a collision
+    FREE = "free"  # as if nothing were there
+    PRIOR = "prior"  # as the map answers for it: occupied with probability 0.5
+
+
+@dataclasses.dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class RayReturns:
+    """Where N rays end: the distribution of min(first return, maximum range). Ranges from the rays' origins, m."""
+
+    hit_probability: Float64  # (N,) of a return before the maximum range
+    mean_m: Float64  # (N,)
+    std_m: Float64  # (N,)
+    quantile_m: Float64  # (N, Q); the maximum range, where a return before it is too unlikely
+    unknown_range_m: Float64  # (N,) where the ray first enters unobserved space; NaN: nowhere before it ends
+    unknown_share: Float64  # (N,) of the ray's expected length, in unobserved space
+    step_m: float  # of the summation, at most
+    map_revision: int
+
+
+@dataclasses.dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class PathRisk:
+    """How likely a robot on P poses touches something.
+
+    The truth of the joint probability lies between `max_probability`, where all cells are one trial, and the sum of them all;
+    `union_probability` takes cells as independent beyond the correlation length.
+    """
+
+    max_probability: Float64  # (P,) of the likeliest cell that the robot covers
+    union_probability: Float64  # (P,) that any of its cells is occupied
+    unknown_share: Float64  # (P,) of its cells, unobserved
+    path_max_probability: float
+    path_union_probability: float  # every cell of the swept volume counted once
+    path_unknown_share: float
+    n_cells: int  # of the swept volume
+    resolution_m: float  # edge of a cell
+    map_revision: int
 
 
 class TileChange(NamedTuple):
@@ -265,7 +314,7 @@ class MapUpdate:
         int  # of those, carried from atoms; the others were placed where nothing explained the data
     )
     map_kernels: int
-    converged: bool  # both joint solves reached their tolerance; if not, the weights are the best found
+    converged: bool  # neither joint solve got stuck; if one did, its weights are the best found
     rule: AnswerRule  # what turns `kernels` into answers
     changed: TileChange
     timings_ms: dict[str, float]  # per stage of the pipeline

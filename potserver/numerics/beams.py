@@ -63,3 +63,13 @@ def label_beams(
         np.concatenate([np.ones(len(hit), bool), np.zeros(len(free), bool)]),
         np.concatenate([hit, np.repeat(long_enough, free_per_beam)]),
     )
+
+
+def beam_weights(labelled: LabelledPoints) -> Float64:
+    """(N,) how much each point counts: a beam's hit 1, and its free points 1 together.
+
+    So hits and free points weigh as beams see them, however many free points are drawn, and a fit needs no bias of its own.
+    """
+    free = ~labelled.occupied
+    per_beam = np.bincount(labelled.beam[free], minlength=int(labelled.beam.max(initial=-1)) + 1)
+    return np.where(labelled.occupied, 1.0, 1.0 / np.maximum(per_beam[labelled.beam], 1))

@@ -12,12 +12,14 @@ large coordinates lose nothing in float32), and a dense SIMD loop runs over quer
 
 from __future__ import annotations
 
+import itertools
 from typing import NamedTuple
 
 import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from potserver.numerics.cubes import sort_into_cubes
 from potserver.numerics.fastexp import FAST, exp32
 from potserver.numerics.threads import parallel_map, spans
 
@@ -32,6 +34,7 @@ _SAMPLES = 96
 _FRINGE = 25.0  # gamma d^2 out to which samples lie
 _STACK = 4.0  # kernels within a width of each other that are nothing special
 _TARGET_QUERIES_PER_CUBE = 24
+_PART_CUBE_M = 10.0  # a third of the edge within which points ask together
 
 
 class KernelIndex(NamedTuple):
@@ -193,6 +196,46 @@ def latent_sums(index: KernelIndex, points: Float64, *, threads: int = 1, lane: 
     parallel_map(run, spans(len(cuts) - 1, 16 * threads if threads > 1 else 1), threads, lane)
     out[:, order] = sums
     return LatentSums(*out)
+
+
+class IndexParts(NamedTuple):
+    """Several indices whose sums add: parts of one map, of which only the changed ones were built anew."""
+
+    indices: list[KernelIndex]  # none of them empty
+    lower: Float64  # (P, 3) m: outside its box no kernel of a part is reached
+    upper: Float64
+
+    @staticmethod
+    def of(indices: list[KernelIndex]) -> IndexParts:
+        """Parts of a map; empty ones are left out."""
+        used = [index for index in indices if len(index.hinge)]
+        reach = [index.columns[3].max() for index in used]
+        lower = [index.hinge.min(axis=0) - r for index, r in zip(used, reach, strict=True)]
+        upper = [index.hinge.max(axis=0) + r for index, r in zip(used, reach, strict=True)]
+        return IndexParts(used, np.reshape(lower, (-1, 3)), np.reshape(upper, (-1, 3)))
+
+
+def latent_sums_of_parts(
+    parts: IndexParts, points: Float64, *, threads: int = 1, lane: str = "map"
+) -> LatentSums:
+    """`latent_sums` over all parts of a map. Points near each other ask together, and only the parts that reach them."""
+    if len(parts.indices) == 1:
+        return latent_sums(parts.indices[0], points, threads=threads, lane=lane)
+    total = LatentSums(*np.zeros((3, len(points)), np.float32))
+    if len(points) == 0 or not parts.indices:
+        return total
+    order, cuts, groups = sort_into_cubes(points, _PART_CUBE_M)
+    for a, b in itertools.pairwise(cuts[groups]):
+        members = order[a:b]
+        x = points[members]
+        reached = (parts.lower <= x.max(axis=0)).all(axis=1) & (parts.upper >= x.min(axis=0)).all(axis=1)
+        for number in np.flatnonzero(reached):
+            inside = ((x >= parts.lower[number]) & (x <= parts.upper[number])).all(axis=1)
+            if inside.any():
+                sums = latent_sums(parts.indices[number], x[inside], threads=threads, lane=lane)
+                for out, part in zip(total, sums, strict=True):
+                    out[members[inside]] += part
+    return total
 
 
 def group_points(points: Float64, scale_m: float) -> tuple[Int64, Int64]:

@@ -48,6 +48,7 @@ def fit_sparse(
     *,
     offset: Float32 | None = None,
     sample_weight: Float32 | None = None,
+    start: Float32 | None = None,
     tolerance: float = 1e-3,
     max_newton: int = 12,
     max_conjugate_gradient: int = 60,
@@ -62,6 +63,7 @@ def fit_sparse(
         prior_var: (K,) log-odds^2, > 0.
         offset: (N,) latent that is already explained, log-odds, in the order of the points.
         sample_weight: (N,) how much each point counts; 1 by default.
+        start: (K,) weights to begin with, if they are better than the prior's and than zero.
         tolerance: Gradient norm, relative to the start, at which Newton stops.
         max_newton: Newton steps at most.
         max_conjugate_gradient: Conjugate-gradient steps a Newton step at most.
@@ -78,7 +80,7 @@ def fit_sparse(
     def latent(weights: Float32) -> Float32:
         out = np.empty(n, np.float32)
         parallel_map(
-            lambda s: _rows_dot(features.indptr, features.indices, features.values, weights, s[0], s[1], out),
+            lambda s: rows_dot(features.indptr, features.indices, features.values, weights, s[0], s[1], out),
             rows,
             threads,
         )
@@ -110,13 +112,14 @@ def fit_sparse(
             (count * loss).sum() + 0.5 * (precision * np.square(w - prior_mean, dtype=np.float64)).sum()
         )
 
-    # far from the optimum the curvature vanishes and Newton crawls: start from the prior or from zero, whichever is nearer
-    w = prior_mean.astype(np.float32).copy()
-    f = base + latent(w)
-    value = objective(f, w)
-    zero = np.zeros_like(w)
-    if (at_zero := objective(base, zero)) < value:
-        w, f, value = zero, base.copy(), at_zero
+    # far from the optimum the curvature vanishes and Newton crawls: start from the best there is
+    w, f, value = np.zeros(k, np.float32), base.copy(), math.inf
+    for candidate in (np.zeros(k, np.float32), prior_mean, start):
+        if candidate is None:
+            continue
+        candidate_f = base + latent(candidate) if candidate.any() else base.copy()
+        if (at_candidate := objective(candidate_f, candidate)) < value:
+            w, f, value = candidate.astype(np.float32), candidate_f, at_candidate
     start_norm, norm, n_newton, n_cg, converged = 0.0, 0.0, 0, 0, n == 0 or k == 0
     curvature = np.zeros(n, np.float32)
     while not converged:
@@ -193,7 +196,7 @@ def _conjugate_gradient(
 
 
 @nb.njit(nogil=True, fastmath=FAST, error_model="numpy", cache=True)
-def _rows_dot(indptr, indices, values, w, first, last, out):
+def rows_dot(indptr, indices, values, w, first, last, out):
     for i in range(first, last):
         s = np.float32(0)
         for e in range(indptr[i], indptr[i + 1]):

@@ -18,18 +18,20 @@ class Prediction(NamedTuple):
     var: Float  # (N,) variance of that probability, in [0, 0.25]
 
 
-def predict_occupancy(latent_mean: Float, latent_var: Float) -> Prediction:
+def predict_occupancy(latent_mean: Float, latent_var: Float, mean_moderation: float = 1.0) -> Prediction:
     """Mean and variance of the occupancy probability.
 
-        mean = sigmoid(mu / sqrt(1 + pi s2 / 8)),   var = mean (1 - mean) (1 - 1 / sqrt(1 + pi s2 / 8))
+        mean = sigmoid(mu / sqrt(1 + c pi s2 / 8)),   var = mean (1 - mean) (1 - 1 / sqrt(1 + pi s2 / 8))
 
     Args:
         latent_mean: (N,) log-odds.
         latent_var: (N,) log-odds^2, >= 0.
+        mean_moderation: c. With 1, the mean of p for f ~ Normal; less where that variance ignores what errors have in common
+            and would pull the mean too far towards 0.5.
     Source: moderated sigmoid, MacKay 1992; its variance in the same scaling, Daunizeau 2017.
     """
     scale = 1.0 / np.sqrt(1.0 + (math.pi / 8.0) * latent_var)
-    mean = sigmoid(latent_mean * scale)
+    mean = sigmoid(latent_mean / np.sqrt(1.0 + (mean_moderation * math.pi / 8.0) * latent_var))
     return Prediction(mean, mean * (1.0 - mean) * (1.0 - scale))
 
 

@@ -1,20 +1,24 @@
-"""Learn atoms from scans: a Bayesian logistic regression of weights on kernels placed on the data of each sector."""
+"""Learn atoms from scans: an automorphing Bayesian Hilbert map (ABHM) of each sector, started on a lattice over its data."""
 
 from __future__ import annotations
 
 import dataclasses
+import functools
 import itertools
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
-from potserver.domain.dictionary import AtomDictionary
-from potserver.domain.types import Atom, Float32, Float64, KernelSet, Scan
-from potserver.errors import EmptyError, SettingsError, SolverError
+from potserver.domain.types import Atom, Bool, Float32, Float64, KernelSet, Scan
+from potserver.errors import EmptyError, SettingsError, ShapeError, SolverError
+from potserver.numerics.abhm import AbhmEpoch, AbhmPosterior, AbhmSettings, fit_abhm
 from potserver.numerics.beams import label_beams, limit_range
-from potserver.numerics.coupling import Ragged, coupling_costs
-from potserver.numerics.geometry import in_sector, rotation_z, sector_edges, thin, yaw_of
-from potserver.numerics.logistic import fit_dense
-from potserver.services.refinement import place_kernels
+from potserver.numerics.geometry import in_sector, rotation_z, sector_edges, thin, voxel_pick, yaw_of
+
+_LENGTH_IN_SPACINGS = (
+    1.0  # length scale that a kernel starts with; narrower ones cannot bridge the gaps between rings
+)
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -24,84 +28,228 @@ class LearningSettings:
     n_sectors: int = 6
     min_range_m: float = 0.3
     max_range_m: float = 25.0
-    free_per_beam: int = 3
+    free_per_beam: int = 3  # a beam's free samples count together as much as its hit
     gap_m: float = 0.3
-    coarse_m: float = 2.0  # kernel spacing anywhere
-    fine_m: float = 0.7  # kernel spacing at hits
-    max_labelled: int = 6_000  # points a sector is learned from
+    max_labelled: int = 10_000  # points a sector is learned from
     max_points: int = 500  # of each label that the atom keeps
     min_hits: int = 40  # sectors with fewer make no atom
-    prior_vars: tuple[float, ...] = (10.0, 30.0, 100.0)  # the log evidence picks one
+    max_kernels: int = 400  # of an atom
+    points_per_kernel: int = 8  # at least; sectors with few points get fewer kernels
+    # of the ABHM; see numerics/abhm.py
+    weight_var: float = 200.0  # log-odds^2
+    hinge_reach: float = 1.0
+    gamma_shape: float = 2.0
+    max_epochs: int = 10
+    dispersion_epochs: int = 4
+    steps: int = 60
+    batch: int = 2_000
+    learning_rate: float = 0.1
+
+    def __post_init__(self) -> None:
+        for name in (
+            "n_sectors",
+            "free_per_beam",
+            "max_labelled",
+            "max_points",
+            "max_kernels",
+            "points_per_kernel",
+        ):
+            if getattr(self, name) < 1:
+                raise SettingsError(f"{name} must be at least 1, got {getattr(self, name)}")
+        if not self.gap_m >= 0.0:
+            raise SettingsError(f"gap_m must be at least 0, got {self.gap_m}")
+        if not 0.0 <= self.min_range_m < self.max_range_m:
+            raise SettingsError(
+                f"need 0 <= min_range_m ({self.min_range_m}) < max_range_m ({self.max_range_m})"
+            )
+
+        try:
+            _ = self.abhm
+        except ShapeError as error:
+            raise SettingsError(str(error)) from error
+
+    @property
+    def abhm(self) -> AbhmSettings:
+        """What the numerics need of these."""
+        names = {f.name for f in dataclasses.fields(AbhmSettings)} & {
+            f.name for f in dataclasses.fields(self)
+        }
+        return AbhmSettings(**{name: getattr(self, name) for name in names})
+
+
+class LabelledSector(NamedTuple):
+    """What scans say about one sector."""
+
+    number: int
+    width_rad: float
+    points: Float64  # (N, 3) m, hits and free samples in the sector's frame: sensor at the origin, x along the bisector
+    occupied: Bool  # (N,)
+
+
+def cut_sectors(
+    scans: Sequence[Scan], settings: LearningSettings, rng: np.random.Generator
+) -> list[LabelledSector]:
+    """All sectors about the first scan's sensor, with the labels of all scans."""
+    points, occupied = [], []
+    for scan in scans:
+        beams = limit_range(scan.beams, settings.min_range_m, settings.max_range_m)
+        labelled = label_beams(beams, free_per_beam=settings.free_per_beam, gap_m=settings.gap_m, rng=rng)
+        points.append(labelled.points + (scan.origin - scans[0].origin))
+        occupied.append(labelled.occupied)
+    where, labels = np.concatenate(points), np.concatenate(occupied)
+    heading = yaw_of(scans[0].T_map_sensor)
+    sectors = []
+    for number, (low, high) in enumerate(itertools.pairwise(sector_edges(settings.n_sectors))):
+        inside = in_sector(where, heading + low, heading + high, settings.max_range_m)
+        local = where[inside] @ rotation_z(heading + (low + high) / 2.0)
+        sectors.append(LabelledSector(number, float(high - low), local, labels[inside]))
+    return sectors
+
+
+class SectorEpoch(NamedTuple):
+    """Where learning one sector stands."""
+
+    sector: int
+    epoch: AbhmEpoch  # kernels in the atom's frame
 
 
 def learn_atoms(
-    scan: Scan, name: str, settings: LearningSettings, provenance: dict[str, str], *, seed: int = 0
+    scans: Scan | Sequence[Scan],
+    name: str,
+    settings: LearningSettings,
+    provenance: dict[str, str],
+    *,
+    seed: int = 0,
+    threads: int = 1,
+    on_epoch: Callable[[SectorEpoch], None] | None = None,
+    on_failure: Callable[[int, SolverError], None] | None = None,
 ) -> list[Atom]:
-    """One atom for each sector of a scan that has enough hits.
+    """One atom for each sector about the first scan that has enough hits.
 
     Args:
-        scan: Its pose gives the vertical; the map frame is of no other use.
+        scans: One scan, or several of one place that are learned together; the first one's pose gives the sectors.
         name: Prefix of the atom ids.
         settings: How.
-        provenance: Copied into every atom, with what this function adds: sector, learner, evidence.
-        seed: Of the free samples and of every subsample.
+        provenance: Copied into every atom, with what this function adds: sector, learner and how it ended.
+        seed: Of the free samples, of every subsample and of the learner.
+        threads: Of the learner.
+        on_epoch: Called with every epoch of every sector.
+        on_failure: Called with the number of a sector whose learning diverged, which then makes no atom; without it the
+            error is raised.
+    Raises:
+        EmptyError: no scans.
+        SolverError: a sector's learning diverged, and nobody asked to be told.
     """
+    window = [scans] if isinstance(scans, Scan) else list(scans)
+    if not window:
+        raise EmptyError("no scans to learn from")
     rng = np.random.default_rng(seed)
-    beams = limit_range(scan.beams, settings.min_range_m, settings.max_range_m)
-    labelled = label_beams(beams, free_per_beam=settings.free_per_beam, gap_m=settings.gap_m, rng=rng)
-    heading = yaw_of(scan.T_map_sensor)
-    edges = sector_edges(settings.n_sectors)
     atoms = []
-    for number, (low, high) in enumerate(itertools.pairwise(edges)):
-        members = in_sector(labelled.points, heading + low, heading + high, settings.max_range_m)
-        points = labelled.points[members] @ rotation_z(heading + (low + high) / 2.0)
-        occupied = labelled.occupied[members]
-        if int(occupied.sum()) < settings.min_hits:
+    for number, width_rad, local, labels in cut_sectors(window, settings, rng):
+        if int(labels.sum()) < settings.min_hits:
             continue
-        if len(points) > settings.max_labelled:
-            drawn = rng.choice(len(points), settings.max_labelled, replace=False)
-            points, occupied = points[drawn], occupied[drawn]
-        kernels, prior_var, evidence = _learn(points, occupied, settings)
-        hits, free = points[occupied], points[~occupied]
+        sector_seed = seed * settings.n_sectors + number
+        watch = functools.partial(_of_sector, number, on_epoch) if on_epoch else None
+        try:
+            learned = learn_kernels(
+                local, labels, settings, seed=sector_seed, threads=threads, on_epoch=watch
+            )
+        except SolverError as error:
+            if on_failure is None:
+                raise
+            on_failure(number, error)
+            continue
         atoms.append(
             Atom(
                 atom_id=f"{name}-s{number}",
-                dims=2 if scan.is_planar else 3,
-                hit_points=_keep(hits, settings.max_points, rng),
-                free_points=_keep(free, settings.max_points, rng),
-                kernels=kernels,
+                dims=2 if window[0].is_planar else 3,
+                hit_points=_keep(local[labels], settings.max_points, rng),
+                free_points=_keep(local[~labels], settings.max_points, rng),
+                kernels=_kernel_set(learned),
                 radius_m=settings.max_range_m,
-                azimuth_width_rad=float(high - low),
+                azimuth_width_rad=width_rad,
                 provenance=provenance
                 | {
                     "sector": str(number),
-                    "learner": f"Laplace, kernels every {settings.coarse_m} m and every {settings.fine_m} m at hits",
-                    "prior_var": f"{prior_var:g}",
-                    "log_evidence_per_point": f"{evidence / len(points):.4f}",
+                    "scans": str(len(window)),
+                    "learner": "ABHM, collapsed weights",
+                    "learner_epochs": str(len(learned.objectives) - 1),
+                    "learner_converged": str(learned.converged).lower(),
+                    "nats_per_point": f"{learned.objectives[-1]:.4f}",
                 },
             )
         )
     return atoms
 
 
-def _learn(
-    points: Float64, occupied: np.ndarray, settings: LearningSettings
-) -> tuple[KernelSet, float, float]:
-    placed = KernelSet.concatenate(
-        [place_kernels(points, settings.coarse_m, 1.0), place_kernels(points[occupied], settings.fine_m, 1.0)]
+def _of_sector(number: int, on_epoch: Callable[[SectorEpoch], None], epoch: AbhmEpoch) -> None:
+    on_epoch(SectorEpoch(number, epoch))
+
+
+def learn_kernels(
+    points: Float64,
+    occupied: Bool,
+    settings: LearningSettings,
+    *,
+    seed: int = 0,
+    threads: int = 1,
+    on_epoch: Callable[[AbhmEpoch], None] | None = None,
+) -> AbhmPosterior:
+    """The ABHM of one sector's labelled points, of which at most `max_labelled` are drawn.
+
+    Args:
+        points: (N, 3) m, hits and free samples.
+        occupied: (N,) labels.
+        settings: How.
+        seed, threads, on_epoch: As for `fit_abhm`.
+    """
+    if len(points) > settings.max_labelled:
+        drawn = np.random.default_rng(seed).choice(len(points), settings.max_labelled, replace=False)
+        points, occupied = points[drawn], occupied[drawn]
+    n_kernels = max(1, min(settings.max_kernels, len(points) // settings.points_per_kernel))
+    hinge, gamma = lattice(points, n_kernels)
+    return fit_abhm(
+        points, occupied, hinge, gamma, settings.abhm,
+        sample_weight=beam_weights(occupied, settings.free_per_beam), seed=seed, threads=threads, on_epoch=on_epoch,
+    )  # fmt: skip
+
+
+def beam_weights(occupied: Bool, free_per_beam: int) -> Float32:
+    """(N,) weights by which a beam's free samples count together as much as its hit; 1 on average."""
+    weight = np.where(occupied, 1.0, 1.0 / free_per_beam)
+    return (weight / weight.mean()).astype(np.float32)
+
+
+def lattice(points: Float64, n_kernels: int) -> tuple[Float64, Float64]:
+    """Hinges (K, 3), m, and gammas (K,), 1/m^2, on the finest cubic lattice that has at most `n_kernels` cells with points.
+
+    Cells are aligned to the origin, so points all about it fill up to eight of the coarsest ones, however few are wanted.
+    Points of one plane give hinges in that plane.
+    """
+    flat = np.ptp(points, axis=0) == 0.0
+    coarse = max(float(np.ptp(points, axis=0).max()), 1e-3)
+    fine = coarse / 1024.0
+    for _ in range(24):  # bisection of the spacing
+        spacing = (coarse * fine) ** 0.5
+        if len(voxel_pick(points, spacing)) > n_kernels:
+            fine = spacing
+        else:
+            coarse = spacing
+    picked = voxel_pick(points, coarse)
+    hinge = (np.floor(points[picked] / coarse) + 0.5) * coarse
+    hinge[:, flat] = points[0, flat]
+    return hinge, np.full(len(hinge), 0.5 / (_LENGTH_IN_SPACINGS * coarse) ** 2)
+
+
+def _kernel_set(learned: AbhmPosterior) -> KernelSet:
+    return KernelSet(
+        hinge_mean=learned.hinge_mean,
+        hinge_var=learned.hinge_var,
+        gamma_shape=learned.gamma_shape,
+        gamma_rate=learned.gamma_rate,
+        weight_mean=learned.weight_mean,
+        weight_var=learned.weight_var,
     )
-    d2 = np.square(points[:, None, :] - placed.hinge_mean[None]).sum(axis=2)
-    phi = np.exp(-placed.gamma.astype(np.float64) * d2)
-    k = len(placed)
-    fits = [(v, fit_dense(phi, occupied, np.zeros(k), np.full(k, v))) for v in settings.prior_vars]
-    solved = [fit for fit in fits if fit[1].converged]
-    if not solved:
-        raise SolverError(
-            f"no prior variance of {settings.prior_vars} let the weights of {k} kernels converge"
-        )
-    prior_var, best = max(solved, key=lambda fit: fit[1].log_evidence)
-    kernels = placed.replace(weight_mean=best.mean.astype(np.float32), weight_var=best.var.astype(np.float32))
-    return kernels, prior_var, best.log_evidence
 
 
 def _keep(points: Float64, n: int, rng: np.random.Generator) -> Float32:
@@ -113,37 +261,3 @@ def _keep(points: Float64, n: int, rng: np.random.Generator) -> Float32:
         cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(picked))
         picked = np.asarray(cloud.farthest_point_down_sample(n).points)
     return picked.astype(np.float32)
-
-
-def choose_diverse(atoms: list[Atom], n: int, *, threads: int = 1) -> AtomDictionary:
-    """Farthest-first choice of `n` atoms under the squared 2-Wasserstein distance of hits plus that of free points.
-
-    Raises:
-        EmptyError: no atoms to choose from.
-        SettingsError: n is not positive.
-    """
-    if not atoms:
-        raise EmptyError("no sector had enough hits to make an atom")
-    if n < 1:
-        raise SettingsError(f"cannot choose {n} atoms")
-    rng = np.random.default_rng(0)
-    distance = np.zeros((len(atoms), len(atoms)))
-    pairs = np.stack(
-        np.meshgrid(np.arange(len(atoms)), np.arange(len(atoms)), indexing="ij"), axis=-1
-    ).reshape(-1, 2)
-    for points_of, count in ((lambda a: a.hit_points, 100), (lambda a: a.free_points, 60)):
-        sets = []
-        for atom in atoms:
-            points = points_of(atom)
-            centred = points - atom.hit_points.mean(axis=0)
-            sets.append(centred[thin(centred, count, 0.4, rng)].astype(np.float32))
-        packed = Ragged.of(sets)
-        solved = coupling_costs(packed, packed, pairs, reg=2.0, tolerance=1e-3, threads=threads)
-        distance += np.where(solved.converged, solved.cost, np.inf).reshape(distance.shape)
-    # the most typical atom first, then whatever is farthest from all chosen so far
-    chosen = [int(distance.mean(axis=1).argmin())]
-    while len(chosen) < min(n, len(atoms)):
-        nearest = distance[:, chosen].min(axis=1)
-        nearest[chosen] = -np.inf
-        chosen.append(int(nearest.argmax()))
-    return AtomDictionary(tuple(atoms[i] for i in sorted(chosen)))

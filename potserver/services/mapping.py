@@ -5,14 +5,15 @@ from __future__ import annotations
 import itertools
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import NamedTuple
 
 import numpy as np
 
 from potserver.domain.dictionary import AtomDictionary
-from potserver.domain.kernel_map import KernelMap
+from potserver.domain.kernel_map import IndexedKernels, KernelMap
+from potserver.domain.tiles import TiledMap
 from potserver.domain.types import (
     Float64,
     KernelSet,
@@ -24,18 +25,24 @@ from potserver.domain.types import (
     yaw_pose,
 )
 from potserver.errors import EmptyError
-from potserver.numerics.beams import Beams, LabelledPoints, label_beams, limit_range
-from potserver.numerics.geometry import in_sector, rotation_z, sector_edges, voxel_pick, yaw_of
-from potserver.numerics.kernel_index import sparse_features
+from potserver.numerics import evidence
+from potserver.numerics.beams import Beams, LabelledPoints, beam_weights, label_beams, limit_range
+from potserver.numerics.geometry import in_sector, rotation_z, sector_edges, yaw_of
 from potserver.numerics.threads import default_threads, parallel_map
+from potserver.services.fusion import Fused, fuse, grid_for
 from potserver.services.matching import Match, Matcher
-from potserver.services.refinement import Refined, activation, fill_kernels, is_fine, is_too_wide, refine
+from potserver.services.refinement import Refined, refine
 from potserver.services.settings import MappingSettings
 from potserver.services.transport import Transported, transport
 
+_INSTANT_VOXEL = 2.0  # resolutions: the free points of such a voxel are one datum of the instantaneous map; hits in half of it
+
 
 class MappingService:
-    """One map. `integrate` and `clear` have one caller at a time; `snapshot` may be read from any thread, and never waits."""
+    """One map. `integrate` and `clear` have one caller at a time; `snapshot` may be read from any thread, and never waits.
+
+    `use_dictionary` may be called from any thread: the next scan sees the change, one in work does not.
+    """
 
     def __init__(
         self,
@@ -56,17 +63,27 @@ class MappingService:
             seed: Of every random choice; the same scans in the same order give the same map, up to rounding.
         """
         self.map_id = map_id
-        self.dictionary = dictionary if dictionary is not None else AtomDictionary.builtin()
         self.settings = settings or MappingSettings()
         self.n_scans = 0
         self.atom_usage: Counter[str] = Counter()
         self._threads = threads or default_threads()
         self._seed = seed
-        self._matchers = {
-            dims: Matcher(self.dictionary.of_dims(dims), self.settings, threads=self._threads, seed=seed)
+        self.use_dictionary(dictionary if dictionary is not None else AtomDictionary.builtin())
+        self._tiled: TiledMap | None = None  # what the next scan builds on; its grid is chosen by the first
+        self.snapshot = self._map_of(KernelSet.empty(), revision=0)
+
+    @property
+    def dictionary(self) -> AtomDictionary:
+        """The atoms that the next scan is matched against."""
+        return self._atoms.dictionary
+
+    def use_dictionary(self, dictionary: AtomDictionary) -> None:
+        """Match against other atoms from the next scan on; the map keeps what it has."""
+        matchers = {
+            dims: Matcher(dictionary.of_dims(dims), self.settings, threads=self._threads, seed=self._seed)
             for dims in (2, 3)
         }
-        self.snapshot = self._map_of(KernelSet.empty(), revision=0)
+        self._atoms = _AtomsInUse(dictionary, matchers)  # one assignment: no scan sees a half of it
 
     def integrate(self, scan: Scan) -> MapUpdate:
         """Carry atoms to a scan and add it to the map.
@@ -81,36 +98,45 @@ class MappingService:
             labelled = label_beams(
                 beams, free_per_beam=self.settings.free_per_beam, gap_m=self.settings.gap_m, rng=rng
             )
-            sectors = self._cut_sectors(labelled, scan)
+            drawn = self._draw(labelled, len(beams.ends), rng)
+            sectors = self._cut_sectors(drawn, scan)
         with clock("match"):
-            matches = self._matchers[2 if scan.is_planar else 3].match(sectors)
+            matches = self._atoms.matchers[2 if scan.is_planar else 3].match(sectors)
         with clock("transport"):
             transported = self._transport(matches, sectors)
         carried = KernelSet.concatenate([t.kernels for t in transported if t is not None])
         in_map = labelled._replace(points=labelled.points + scan.origin)
         if self.settings.refine:
+            tiled = self._tiled or TiledMap.empty(grid_for(beams, self.settings))
+            prior = carried.replace(weight_var=carried.weight_var + np.float32(self.settings.borrowed_var))
             with clock("refine"):
-                prior = carried.replace(
-                    weight_var=carried.weight_var + np.float32(self.settings.borrowed_var)
-                )
-                instantaneous, solved = self._refine(prior, in_map, self.settings.instant_tolerance)
+                instantaneous = self._refine(prior, in_map, _INSTANT_VOXEL * tiled.grid.fine_m)
             with clock("fuse"):
-                fused = self._fuse(prior, in_map, rng)
+                fused = fuse(
+                    tiled, in_map, beams, scan.origin, prior, self.settings, planar=scan.is_planar,
+                    threads=self._threads,
+                )  # fmt: skip
+            with clock("index"):
+                tiled = tiled.with_tiles(fused.tiles, self.settings.observed_activation)
+                snapshot = self._map_of(list(tiled.parts.values()), revision=self.snapshot.map_revision + 1)
         else:
-            instantaneous, solved = carried, True
-            appended = KernelSet.concatenate([self.snapshot.kernels, carried])
-            fused = _Fused(appended, len(carried), len(carried), True)
-        with clock("index"):
-            snapshot = self._map_of(fused.kernels, revision=self.snapshot.map_revision + 1)
+            instantaneous, fused, tiled = (
+                Refined(carried, True),
+                Fused({}, len(carried), len(carried), True),
+                None,
+            )
+            with clock("index"):
+                appended = KernelSet.concatenate([self.snapshot.kernels, carried])
+                snapshot = self._map_of(appended, revision=self.snapshot.map_revision + 1)
         update = MapUpdate(
             map_revision=snapshot.map_revision,
-            kernels=instantaneous,
+            kernels=instantaneous.kernels,
             sectors=[_report(s, m, t) for s, m, t in zip(sectors, matches, transported, strict=True)],
             n_points=len(beams.ends),
             n_kernels_added=fused.n_added,
             n_kernels_transported=fused.n_transported,
             map_kernels=len(snapshot),
-            converged=solved and fused.converged,
+            converged=instantaneous.converged and fused.converged,
             rule=snapshot.rule,
             changed=self._touched(in_map.points),
             timings_ms=clock.timings_ms,
@@ -118,12 +144,13 @@ class MappingService:
         # nothing above changed the service, and nothing below can fail
         self.atom_usage.update(match.atom_id for match in update.sectors if match.atom_id is not None)
         self.n_scans += 1
-        self.snapshot = snapshot
+        self._tiled, self.snapshot = tiled, snapshot
         return update
 
     def clear(self) -> None:
         """Forget all scans; the revision and the use of atoms go on counting, so that readers notice."""
         self.snapshot = self._map_of(KernelSet.empty(), revision=self.snapshot.map_revision + 1)
+        self._tiled = None
         self.n_scans = 0
 
     def warm_up(self) -> None:
@@ -153,6 +180,16 @@ class MappingService:
             drawn = np.sort(rng.choice(n, self.settings.beams_per_scan, replace=False))
             beams = Beams(beams.ends[drawn], beams.is_return[drawn])
         return beams
+
+    def _draw(self, labelled: LabelledPoints, n_beams: int, rng: np.random.Generator) -> LabelledPoints:
+        """The points of the beams that transport and the instantaneous map are made from."""
+        limit = self.settings.match_beams
+        if n_beams <= limit:
+            return labelled
+        drawn = np.zeros(n_beams, bool)
+        drawn[rng.choice(n_beams, limit, replace=False)] = True
+        members = drawn[labelled.beam]
+        return LabelledPoints(labelled.points[members], labelled.occupied[members], labelled.beam[members])
 
     def _cut_sectors(self, labelled: LabelledPoints, scan: Scan) -> list[Sector]:
         """Cylindrical sectors about the vertical through the sensor, the first one centred on the sensor's heading."""
@@ -186,66 +223,42 @@ class MappingService:
 
         return parallel_map(run, range(len(sectors)), self._threads)
 
-    def _fuse(self, carried: KernelSet, labelled: LabelledPoints, rng: np.random.Generator) -> _Fused:
-        """The overall map after a scan: kernels where the data ask for them, all weights near the scan solved jointly."""
+    def _refine(self, kernels: KernelSet, labelled: LabelledPoints, voxel_m: float) -> Refined:
+        """The instantaneous map: transported weights as prior, the scan's points as data, those of one voxel as one."""
         s = self.settings
-        present = self.snapshot.kernels
-        lower, upper = labelled.points.min(axis=0) - 3.0, labelled.points.max(axis=0) + 3.0
-        near = ((present.hinge_mean >= lower) & (present.hinge_mean <= upper)).all(axis=1)
-        local = present.take(near)
-        # a transported kernel is taken where the scan has data for it and the map has no kernel yet; one much wider than the
-        # map's own would only make the solve harder
-        carried = carried.take(~is_too_wide(carried, s))
-        if len(carried):
-            supported = self._support(carried, labelled, rng) >= 1.0
-            carried = carried.take(supported)
-        if len(carried) and len(local):
-            present_activation = np.empty(len(carried), np.float32)
-            for scale in (False, True):
-                members = is_fine(carried, s) == scale
-                same = local.take(is_fine(local, s) == scale)
-                present_activation[members] = activation(
-                    same, carried.hinge_mean[members], threads=self._threads
-                )
-            carried = carried.take(present_activation < s.explained_activation)
-        filled = fill_kernels(labelled, KernelSet.concatenate([local, carried]), s, threads=self._threads)
-        new = KernelSet.concatenate([carried, filled])
-        refined, converged = self._refine(KernelSet.concatenate([local, new]), labelled, s.refine_tolerance)
-        everything = KernelSet.concatenate([present.take(~near), refined])
-        return _Fused(everything, len(new), len(carried), converged)
-
-    def _refine(self, kernels: KernelSet, labelled: LabelledPoints, tolerance: float) -> Refined:
-        cut = self.settings.feature_cut
-        return refine(kernels, labelled, feature_cut=cut, tolerance=tolerance, threads=self._threads)
-
-    def _support(self, kernels: KernelSet, labelled: LabelledPoints, rng: np.random.Generator) -> np.ndarray:
-        """(K,) about how many labelled points each kernel has, each counted by its activation; from one point in four."""
-        features = sparse_features(
-            labelled.points[rng.random(len(labelled.points)) < 0.25],
-            kernels.hinge_mean,
-            kernels.gamma,
-            cut=0.1,
-            threads=self._threads,
+        corner = labelled.points.min(axis=0)
+        rows, _ = evidence.add(
+            evidence.Rows.empty(),
+            labelled.points - corner,
+            labelled.occupied,
+            beam_weights(labelled),
+            voxel_m,
         )
-        return 4.0 * np.bincount(features.indices, features.values, len(kernels))
+        return refine(
+            kernels, evidence.positions(rows, voxel_m) + corner, rows.occupied, feature_cut=s.feature_cut,
+            tolerance=s.instant_tolerance, threads=self._threads, sample_weight=rows.sums[:, 3],
+        )  # fmt: skip
 
     def _touched(self, points: Float64) -> TileChange:
         size = self.settings.tile_size_m
-        tiles = np.floor(points[voxel_pick(points, size)] / size).astype(np.int64)
+        tile = np.floor(points / size).astype(np.int64)
+        low = tile.min(axis=0)
+        extent = tile.max(axis=0) - low + 1
+        number = np.ravel_multi_index(tuple((tile - low).T), tuple(extent))
+        tiles = np.stack(np.unravel_index(np.flatnonzero(np.bincount(number)), tuple(extent)), axis=1) + low
         return TileChange(size, [(int(x), int(y), int(z)) for x, y, z in tiles])
 
-    def _map_of(self, kernels: KernelSet, *, revision: int) -> KernelMap:
+    def _map_of(self, kernels: KernelSet | Sequence[IndexedKernels], *, revision: int) -> KernelMap:
+        s = self.settings
         return KernelMap(
-            kernels, observed_activation=self.settings.observed_activation, prior_var=self.settings.prior_var,
-            residual_var=self.settings.residual_var, map_revision=revision, threads=self._threads,
+            kernels, observed_activation=s.observed_activation, prior_var=s.prior_var, residual_var=s.residual_var,
+            mean_moderation=s.mean_moderation, map_revision=revision, threads=self._threads,
         )  # fmt: skip
 
 
-class _Fused(NamedTuple):
-    kernels: KernelSet  # of the whole map
-    n_added: int
-    n_transported: int  # of those added
-    converged: bool
+class _AtomsInUse(NamedTuple):
+    dictionary: AtomDictionary
+    matchers: dict[int, Matcher]  # by dimensions
 
 
 def _report(sector: Sector, match: Match | None, transported: Transported | None) -> SectorMatch:

@@ -28,9 +28,12 @@ class MappingSettings:
     # beams
     min_range_m: float = 0.3  # shorter beams hit the robot itself
     max_range_m: float = 25.0  # longer beams are free up to here, and end without an echo
-    free_per_beam: int = 2
+    free_per_beam: int = 3
     gap_m: float = 0.3  # between a hit and its last free point
-    beams_per_scan: int = 8_000  # of a denser scan, that many are drawn
+    beams_per_scan: int = 30_000  # of a denser scan, that many are drawn
+    match_beams: int = (
+        4_000  # of those, as many are cut into sectors: for transport and the instantaneous map
+    )
 
     # sectors
     n_sectors: int = 6
@@ -42,19 +45,19 @@ class MappingSettings:
     )
 
     # ranking (eq. 6-7)
-    rank_hits: int = 96
-    rank_free: int = 64
+    rank_hits: int = 48
+    rank_free: int = 32
     rank_voxel_m: float = 0.4  # points compared are thinned to one a voxel; 0 draws them at random
     rank_reg_m2: float = 5.0
-    rank_tolerance: float = 1e-2
+    rank_tolerance: float = 3e-2
     rank_iterations: int = 1000
     rank_score: RankScore = RankScore.W2
     rotations_deg: tuple[float, ...] = (-30.0, -15.0, 0.0, 15.0, 30.0)
 
     # final coupling (eq. 3-4)
-    couple_points: int = 300
+    couple_points: int = 200
     couple_voxel_m: float = 0.25  # as for ranking
-    couple_reg: float = 0.001  # of the largest cost
+    couple_reg: float = 0.002  # of the largest cost
     couple_tolerance: float = 1e-3
     couple_iterations: int = 2000
     label_aware: bool = (
@@ -68,26 +71,39 @@ class MappingSettings:
     borrowed_var: float = (
         25.0  # log-odds^2, added to the variance of transported weights: borrowed is not seen
     )
-    fill_coarse_m: float = 1.0  # spacing of kernels added where nothing explains a point; 0 adds none
-    fill_fine_m: float = 0.3  # the same near hits
-    feature_cut: float = 0.02  # activations below this are left out of the solve
-    refine_tolerance: float = 0.03  # of the gradient, at which the overall map's solve stops
-    instant_tolerance: float = 0.1  # the same for the instantaneous map
-    explained_activation: float = 1.0  # a point with less from kernels of the right scale gets one of its own
+    feature_cut: float = 0.02  # activations below this are left out of the solves
+    instant_tolerance: float = 0.1  # of the gradient, at which the instantaneous map's solve stops
+
+    # overall map
+    fine_m: float = 0.0  # resolution; 0: a 25th of the first scan's median range, between 0.2 and 0.4
+    newton_steps: int = (
+        2  # of each scan's solve, from where the map is; up to three times as many where they are cheap
+    )
+    gradient_steps: int = 4  # conjugate-gradient steps for each of them
+    cheap_values: int = 60_000_000  # features that a solve may touch for more Newton steps
+    saturation: float = 20.0  # looks at one place that count; further ones repeat them
+    memory: float = 200.0  # looks that one place keeps; older ones give way
+    fade_rate: float = 0.05  # by which hits weaken with each beam that passes through them; 0: never
+    max_kernels_per_tile: int = 8_000
+    carry_into_map: bool = False  # transported kernels join the overall map too, with their weights as prior
 
     # answers
     observed_activation: float = 0.05  # with less around it, a point is unobserved
     residual_var: float = 50.0  # log-odds^2, see KernelMap; 0 is the paper's model
-    tile_size_m: float = 10.0  # granularity of change notices
+    mean_moderation: float = (
+        0.05  # share of the latent variance that pulls means towards 0.5, see KernelMap; 1 is the paper's
+    )
+    tile_size_m: float = 10.0  # the map's unit of storage and of change notices
 
     def __post_init__(self) -> None:
         for name in (
             "min_range_m",
             "gap_m",
-            "fill_coarse_m",
-            "fill_fine_m",
+            "fine_m",
+            "fade_rate",
             "borrowed_var",
             "residual_var",
+            "mean_moderation",
             "rank_voxel_m",
             "couple_voxel_m",
         ):
@@ -95,8 +111,8 @@ class MappingSettings:
         for name in (
             "max_range_m", "free_per_beam", "beams_per_scan", "n_sectors", "rank_hits", "rank_free", "rank_reg_m2",
             "rank_tolerance", "rank_iterations", "couple_points", "couple_reg", "couple_tolerance", "couple_iterations",
-            "prior_var", "feature_cut", "refine_tolerance", "instant_tolerance", "explained_activation",
-            "observed_activation", "tile_size_m",
+            "prior_var", "feature_cut", "instant_tolerance", "observed_activation", "tile_size_m", "match_beams",
+            "newton_steps", "gradient_steps", "cheap_values", "saturation", "memory", "max_kernels_per_tile",
         ):  # fmt: skip
             self._need(name, getattr(self, name) > 0, "positive")
         self._need("rotations_deg", len(self.rotations_deg) > 0, "at least one angle")
@@ -134,6 +150,9 @@ class MappingSettings:
 PAPER = MappingSettings(
     profile="paper",
     max_range_m=20.0,
+    free_per_beam=2,
+    beams_per_scan=8_000,
+    match_beams=8_000,
     n_sectors=5,
     align_sectors=False,
     keep_in_sector=False,
@@ -152,9 +171,8 @@ PAPER = MappingSettings(
     label_aware=False,
     out_of_sample=OutOfSample.NEAREST,
     refine=False,
-    fill_coarse_m=0.0,
-    fill_fine_m=0.0,
     residual_var=0.0,
+    mean_moderation=1.0,
 )
 
 PROFILES = {"default": MappingSettings(), "paper": PAPER}

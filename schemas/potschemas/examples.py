@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 
+import msgspec
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -149,6 +150,7 @@ def examples() -> dict[str, m.Message]:
 
     add(m.PointsQuery(points=_f4([[1.0, 2.0, 0.5], [-3.0, 0.25, 0.5]]), deadline_ms=250.0))
     add(m.PointsQuery(points=_f8([[500_000.25, 5_400_000.5]])), "planar_float64")
+    add(m.PointsQuery(points=_f4([[1.0, 2.0, 0.5]]), with_gradient=True), "gradient")
     occupancy = m.Occupancy(
         mean=_f4([0.875, 0.5]),
         var=_f4([0.015625, 0.25]),
@@ -159,6 +161,19 @@ def examples() -> dict[str, m.Message]:
     )
     none = _f4(np.zeros(0))
     add(occupancy)
+    add(
+        m.Occupancy(
+            mean=_f4([0.875, 0.5]),
+            var=_f4([0.015625, 0.25]),
+            latent_mean=_f4([2.5, 0.0]),
+            latent_var=_f4([0.75, 64.0]),
+            observed=_bool([True, False]),
+            map_revision=31,
+            gradient=_f4([[0.25, -0.125, 0.0], [0.0, 0.0, 0.0]]),
+            latent_gradient=_f4([[2.5, -1.25, 0.0], [0.0, 0.0, 0.0]]),
+        ),
+        "gradient",
+    )
     add(
         m.Occupancy(
             mean=none, var=none, latent_mean=none, latent_var=none, observed=_bool([]), map_revision=0
@@ -178,6 +193,65 @@ def examples() -> dict[str, m.Message]:
             occupancy=occupancy,
         )
     )
+    rays = _f4([[1.0, 2.0, 0.5], [1.0, 2.0, 0.5]])
+    ways = _f4([[1.0, 0.0, 0.0], [0.0, -0.5, 0.5]])
+    add(
+        m.RaysQuery(
+            origins=rays,
+            directions=ways,
+            max_range_m=25.0,
+            quantiles=[0.25, 0.5],
+            unknown=m.Unknown.FREE,
+            width_m=0.5,
+            step_m=0.125,
+            deadline_ms=500.0,
+        )
+    )
+    add(m.RaysQuery(origins=rays, directions=ways, max_range_m=25.0), "minimal")
+    add(
+        m.Rays(
+            hit_probability=_f4([0.96875, 0.25]),
+            mean_m=_f4([7.5, 21.25]),
+            std_m=_f4([0.375, 6.5]),
+            quantile_m=_f4([[7.25, 7.5], [25.0, 25.0]]),
+            unknown_range_m=_f4([math.nan, 8.0]),
+            unknown_share=_f4([0.0, 0.625]),
+            step_m=0.125,
+            map_revision=31,
+        )
+    )
+    path = _f8(
+        [
+            [[1.0, 0.0, 0.0, x], [0.0, 1.0, 0.0, 2.0], [0.0, 0.0, 1.0, 0.25], [0.0, 0.0, 0.0, 1.0]]
+            for x in (1.0, 1.5)
+        ]
+    )
+    body = _f4([[0.25, 0.0, 0.25, 0.5], [-0.25, 0.0, 0.25, 0.5]])
+    add(
+        m.RiskQuery(
+            path=path,
+            spheres=body,
+            unknown=m.Unknown.PRIOR,
+            resolution_m=0.125,
+            correlation_m=0.5,
+            dims=2,
+            deadline_ms=500.0,
+        )
+    )
+    add(m.RiskQuery(path=path, spheres=body), "minimal")
+    add(
+        m.Risk(
+            max_probability=_f4([0.0625, 0.75]),
+            union_probability=_f4([0.125, 0.875]),
+            unknown_share=_f4([0.0, 0.25]),
+            path_max_probability=0.75,
+            path_union_probability=0.9375,
+            path_unknown_share=0.125,
+            n_cells=640,
+            resolution_m=0.125,
+            map_revision=31,
+        )
+    )
     add(m.ParamsQuery(lower=[-8.0, -8.0, -2.0], upper=[8.0, 8.0, 4.0], deadline_ms=1000.0))
     add(m.ParamsQuery(), "whole_map")
     add(m.ParamsPart(part=0, n_parts=2, map_revision=31, kernels=kernels))
@@ -194,18 +268,21 @@ def examples() -> dict[str, m.Message]:
         times_used=17,
         provenance={"licence": "MIT", "source": "generated town 3"},
     )
+    atom = m.Atom(
+        info=info,
+        hit_points=_f4([[5.0, 0.5, 0.0], [5.0, -0.5, 1.0]]),
+        free_points=_f4([[2.5, 0.0, 0.5]]),
+        kernels=kernels,
+    )
     add(m.AtomsQuery(atom_id="street-corner-03"))
     add(m.AtomsQuery(), "list")
+    add(m.AtomsQuery(action=m.AtomsAction.ADD, atom=atom), "add")
+    add(m.AtomsQuery(action=m.AtomsAction.REMOVE, atom_id="street-corner-03"), "remove")
     add(m.AtomList(atoms=[info]))
     add(m.AtomList(atoms=[]), "empty")
-    add(
-        m.Atom(
-            info=info,
-            hit_points=_f4([[5.0, 0.5, 0.0], [5.0, -0.5, 1.0]]),
-            free_points=_f4([[2.5, 0.0, 0.5]]),
-            kernels=kernels,
-        )
-    )
+    add(atom)
+    add(m.AtomsChanged(atom_id="street-corner-03", n_atoms=33, persisted=True))
+    add(m.AtomsChanged(atom_id="street-corner-03", n_atoms=32, persisted=False), "in_memory")
 
     add(m.InfoQuery())
     limits = m.Limits(
@@ -219,6 +296,14 @@ def examples() -> dict[str, m.Message]:
     )
     add(_info(limits, lower=[-40.0, -32.5, -2.0], upper=[88.0, 64.0, 6.5], n_scans=31))
     add(_info(limits, lower=None, upper=None, n_scans=0), "empty_map")
+    ray_limits = msgspec.structs.replace(
+        limits,
+        max_query_rays=50_000,
+        max_query_poses=5_000,
+        max_query_spheres=256,
+        max_query_samples=4_000_000,
+    )
+    add(_info(ray_limits, lower=[-40.0, -32.5, -2.0], upper=[88.0, 64.0, 6.5], n_scans=31), "ray_limits")
     add(m.StatsQuery())
     add(
         m.Stats(
@@ -261,6 +346,14 @@ def examples() -> dict[str, m.Message]:
         ),
         "retry",
     )
+    add(
+        m.ErrorReply(
+            code=m.ErrorCode.ATOM_REFUSED,
+            message="it is a near duplicate of 'street-corner-02'",
+            reason="duplicate",
+        ),
+        "reason",
+    )
     return named
 
 
@@ -294,6 +387,7 @@ def _kernels(k: int, origin: list[float] | None = None) -> m.Kernels:
         observed_activation=0.125,
         prior_var=64.0,
         residual_var=32.0,
+        mean_moderation=0.0625,
     )
 
 
@@ -314,6 +408,7 @@ def _info(limits: m.Limits, *, lower: list[float] | None, upper: list[float] | N
         observed_activation=0.125,
         prior_var=64.0,
         residual_var=32.0,
+        mean_moderation=0.0625,
         limits=limits,
         started_ns=_STAMP_NS,
     )

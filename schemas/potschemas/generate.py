@@ -70,7 +70,8 @@ def readable(value: Any) -> Any:
             "values": readable(array.tolist()),
         }
     if isinstance(value, msgspec.Struct):
-        return {name: readable(getattr(value, name)) for name in value.__struct_fields__}
+        present = {name: getattr(value, name) for name in value.__struct_fields__}
+        return {name: readable(item) for name, item in present.items() if item is not messages.ABSENT}
     if isinstance(value, dict):
         return {name: readable(item) for name, item in value.items()}
     if isinstance(value, list):

@@ -37,7 +37,15 @@ Dims = Annotated[int, msgspec.Meta(ge=2, le=3)]
 Vector3 = Annotated[list[Finite], msgspec.Meta(min_length=3, max_length=3)]
 GridShape = Annotated[list[Count], msgspec.Meta(min_length=3, max_length=3)]
 _Int64 = Annotated[int, msgspec.Meta(ge=-_INT64_MAX - 1, le=_INT64_MAX)]
+Probability = Annotated[float, msgspec.Meta(ge=0, le=1)]
+_Quantile = Annotated[float, msgspec.Meta(gt=0, lt=1)]
+Quantiles = Annotated[list[_Quantile], msgspec.Meta(max_length=16)]
 TileIndex = Annotated[list[_Int64], msgspec.Meta(min_length=3, max_length=3)]
+
+# The type and the default of a field that a released schema got later: it is left out of the bytes, so that messages without
+# it stay as they were.
+Absent = msgspec.UnsetType
+ABSENT = msgspec.UNSET
 
 MAX_AXES = 4
 MAX_AXIS_LENGTH = 2**31 - 1
@@ -102,7 +110,8 @@ class Kernels(Message, frozen=True, kw_only=True):
 
     f(x) = sum_m w_m exp(-gamma_m |x - h_m|^2), gamma_m = gamma_shape_m / gamma_rate_m. A point whose summed
     activation is below `observed_activation` is unobserved: 0.5, with latent variance `prior_var`. Elsewhere the
-    latent variance is sum_m weight_var_m phi_m^2 + residual_var * max(0, 1 - sum_m phi_m).
+    latent variance is sum_m weight_var_m phi_m^2 + residual_var * max(0, 1 - sum_m phi_m), and the mean is
+    sigmoid(f / sqrt(1 + mean_moderation pi latent_var / 8)).
     """
 
     schema: ClassVar[str] = "pot.kernels.v1"
@@ -117,6 +126,7 @@ class Kernels(Message, frozen=True, kw_only=True):
     observed_activation: Finite  # summed activation below which a point is unobserved
     prior_var: Finite  # log-odds^2, of the latent where nothing was observed
     residual_var: Finite  # log-odds^2, added in the measure that the summed activation falls short of 1
+    mean_moderation: Finite = 1.0  # share of the latent variance that pulls the mean towards 0.5
 
 
 class SectorReport(msgspec.Struct, frozen=True, kw_only=True):
@@ -205,6 +215,7 @@ class PointsQuery(Message, frozen=True, kw_only=True):
 
     points: Array  # (N, 3) or (N, 2) float32 or float64, m, map frame
     deadline_ms: Positive | None = None  # ms from arrival; past it no work and no part begins
+    with_gradient: bool | Absent = ABSENT  # true: the answer brings both gradients
 
 
 class Occupancy(Message, frozen=True, kw_only=True):
@@ -218,6 +229,8 @@ class Occupancy(Message, frozen=True, kw_only=True):
     latent_var: Array  # (N,) float32, log-odds^2
     observed: Array  # (N,) bool; false = no kernel near: unknown, which is not free
     map_revision: Count  # all answers are of this one
+    gradient: Array | Absent = ABSENT  # (N, 3) float32, 1/m, of `mean`; 0 where unobserved
+    latent_gradient: Array | Absent = ABSENT  # (N, 3) float32, log-odds/m, of `latent_mean`; likewise
 
 
 class GridQuery(Message, frozen=True, kw_only=True):
@@ -245,6 +258,78 @@ class GridPart(Message, frozen=True, kw_only=True):
     occupancy: Occupancy  # of the cells first_cell, first_cell + 1, ...
 
 
+class Unknown(str, Enum):
+    """What rays and robots take unobserved space for."""
+
+    OCCUPIED = "occupied"  # it stops a ray; touching it is a collision
+    FREE = "free"  # as if nothing were there
+    PRIOR = "prior"  # as the map answers for it: occupied with probability 0.5
+
+
+class RaysQuery(Message, frozen=True, kw_only=True):
+    """`q/rays`: where rays first return. The hazard along a ray is -ln(1 - p) / width, with p the mean of the occupancy."""
+
+    schema: ClassVar[str] = "pot.rays_query.v1"
+
+    origins: Array  # (N, 3) or (N, 2) float32 or float64, m, map frame
+    directions: Array  # (N, 3) or (N, 2) float32 or float64, map frame, of any length but 0
+    max_range_m: Positive  # m, of all rays
+    quantiles: Quantiles | None = None  # ascending, of the range to answer; absent = [0.05, 0.5, 0.95]
+    unknown: Unknown = Unknown.PRIOR  # what rays take unobserved space for
+    width_m: Positive | None = None  # m, over which p counts as one trial; absent = the kernels' own
+    step_m: Positive | None = None  # m, longest step of the summation; absent = fine enough
+    deadline_ms: Positive | None = None  # ms from arrival; past it no work and no part begins
+
+
+class Rays(Message, frozen=True, kw_only=True):
+    """The distribution of min(first return, max_range_m) of N rays, in the order asked; ranges from the origins."""
+
+    schema: ClassVar[str] = "pot.rays.v1"
+
+    hit_probability: Array  # (N,) float32, of a return before max_range_m
+    mean_m: Array  # (N,) float32, m, expected range
+    std_m: Array  # (N,) float32, m, its standard deviation
+    quantile_m: Array  # (N, Q) float32, m; max_range_m where a return before it is too unlikely
+    unknown_range_m: Array  # (N,) float32, m, where the ray enters unobserved space; NaN = it does not
+    unknown_share: Array  # (N,) float32, of the ray's expected length, in unobserved space
+    step_m: Positive  # m, the longest step that was taken
+    map_revision: Count  # all answers are of this one
+
+
+class RiskQuery(Message, frozen=True, kw_only=True):
+    """`q/risk`: how likely a robot on a path touches something. Nothing is covered between the poses."""
+
+    schema: ClassVar[str] = "pot.risk_query.v1"
+
+    path: Array  # (P, 4, 4) float64, T_map_body, rigid
+    spheres: Array  # (S, 4) float32 or float64, m: centre in the body frame, and radius
+    unknown: Unknown = Unknown.OCCUPIED  # what unobserved cells are taken for
+    resolution_m: Positive | None = None  # m, edge of a cell; absent = half the smallest radius
+    correlation_m: Positive | None = None  # m, edge of a cube that is one trial; absent = the kernels' own
+    dims: Dims = 3  # 2 = the spheres are discs in the plane z = 0
+    deadline_ms: Positive | None = None  # ms from arrival; past it no work and no part begins
+
+
+class Risk(Message, frozen=True, kw_only=True):
+    """The risk of a path. A cell is covered when its centre lies in a sphere, or a sphere's centre lies in it.
+
+    Cell (i, j, k) is centred at (i + .5, j + .5, k + .5) * resolution_m in the map frame. With d = `dims`, the union is
+    1 - exp(-sum -ln(1 - p) (resolution_m / correlation_m)^d) over the cells, but at least the likeliest cell.
+    """
+
+    schema: ClassVar[str] = "pot.risk.v1"
+
+    max_probability: Array  # (P,) float32, of the likeliest cell: all cells are one trial
+    union_probability: Array  # (P,) float32, that any cell is occupied, by cubes of correlation_m
+    unknown_share: Array  # (P,) float32, of its cells, unobserved
+    path_max_probability: Probability  # of the likeliest cell of the swept volume
+    path_union_probability: Probability  # that any cell of the swept volume is occupied, each counted once
+    path_unknown_share: Probability  # of the swept volume's cells, unobserved
+    n_cells: Count  # of the swept volume
+    resolution_m: Positive  # m, edge of a cell
+    map_revision: Count  # all answers are of this one
+
+
 class ParamsQuery(Message, frozen=True, kw_only=True):
     """`q/params`: the kernels of the overall map, whole or inside a box; the reply comes in parts."""
 
@@ -266,14 +351,6 @@ class ParamsPart(Message, frozen=True, kw_only=True):
     kernels: Kernels  # this part's kernels; the origin may differ from part to part
 
 
-class AtomsQuery(Message, frozen=True, kw_only=True):
-    """`q/atoms`: list the dictionary, or fetch one atom whole."""
-
-    schema: ClassVar[str] = "pot.atoms_query.v1"
-
-    atom_id: str | None = None  # absent = list all
-
-
 class AtomInfo(msgspec.Struct, frozen=True, kw_only=True):
     """One line of the dictionary's table."""
 
@@ -289,7 +366,7 @@ class AtomInfo(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class AtomList(Message, frozen=True, kw_only=True):
-    """The reply to an `AtomsQuery` without an id."""
+    """The reply to an `AtomsQuery` that reads, without an id."""
 
     schema: ClassVar[str] = "pot.atom_list.v1"
 
@@ -297,7 +374,7 @@ class AtomList(Message, frozen=True, kw_only=True):
 
 
 class Atom(Message, frozen=True, kw_only=True):
-    """One atom whole: the reply to an `AtomsQuery` with an id."""
+    """One atom whole: the reply to an `AtomsQuery` that reads one, and what a `*.atom` file holds."""
 
     schema: ClassVar[str] = "pot.atom.v1"
 
@@ -305,6 +382,34 @@ class Atom(Message, frozen=True, kw_only=True):
     hit_points: Array  # (H, 3) float32, m, atom frame: sensor at the origin, x along the sector's bisector
     free_points: Array  # (F, 3) float32, m, atom frame
     kernels: Kernels  # atom frame
+
+
+class AtomsAction(str, Enum):
+    """What `q/atoms` is asked to do."""
+
+    READ = "read"  # list the dictionary, or fetch one atom
+    ADD = "add"  # put an atom into the dictionary, for every map of the server
+    REMOVE = "remove"  # take one out; maps keep the kernels that were carried from it
+
+
+class AtomsQuery(Message, frozen=True, kw_only=True):
+    """`q/atoms`: list the dictionary, fetch one atom whole, or change the dictionary."""
+
+    schema: ClassVar[str] = "pot.atoms_query.v1"
+
+    atom_id: str | None = None  # which one to fetch or to remove; absent = list all, or add `atom`
+    action: AtomsAction | Absent = ABSENT  # absent = read
+    atom: Atom | Absent = ABSENT  # to be added; its times_used and its kernels' scalars do not matter
+
+
+class AtomsChanged(Message, frozen=True, kw_only=True):
+    """The reply to an `AtomsQuery` that added or removed an atom; scans that are integrated from now on see the change."""
+
+    schema: ClassVar[str] = "pot.atoms_changed.v1"
+
+    atom_id: str  # which atom came or went
+    n_atoms: Count  # in the dictionary now
+    persisted: bool  # true: it is on the server's disk; false: a restart of the server forgets it
 
 
 class InfoQuery(Message, frozen=True, kw_only=True):
@@ -323,6 +428,10 @@ class Limits(msgspec.Struct, frozen=True, kw_only=True):
     max_grid_cells: Count  # in one `q/grid`
     max_range_m: Finite  # m, beams are used up to here
     max_coordinate_m: Finite  # m, |x|, |y|, |z| in the map frame
+    max_query_rays: Count | Absent = ABSENT  # in one `q/rays`
+    max_query_poses: Count | Absent = ABSENT  # in one `q/risk`
+    max_query_spheres: Count | Absent = ABSENT  # in one `q/risk`
+    max_query_samples: Count | Absent = ABSENT  # steps of all rays of a `q/rays`, cells of a `q/risk`
 
 
 class Info(Message, frozen=True, kw_only=True):
@@ -345,6 +454,7 @@ class Info(Message, frozen=True, kw_only=True):
     observed_activation: Finite  # summed activation below which a point is unobserved
     prior_var: Finite  # log-odds^2, of the latent where nothing was observed
     residual_var: Finite  # log-odds^2, added in the measure that the summed activation falls short of 1
+    mean_moderation: Finite = 1.0  # share of the latent variance that pulls the mean towards 0.5
     limits: Limits  # what the server accepts
     started_ns: Sequence  # when the server started
 
@@ -416,6 +526,10 @@ class ErrorCode(str, Enum):
     NO_POSE = "no_pose"  # no pose given, and none to interpolate at the stamp
     UNKNOWN_ROBOT = "unknown_robot"  # not a legal id, or not on the allow list
     UNKNOWN_ATOM = "unknown_atom"  # not in the dictionary
+    ATOM_REFUSED = (
+        "atom_refused"  # the atom may not join the dictionary; the field `reason` says which rule it breaks
+    )
+    READ_ONLY = "read_only"  # the server takes no changes of its dictionary
     UNSUPPORTED = "unsupported"  # no such operation or verb
     OVERLOADED = "overloaded"  # the queue is full; retry after retry_after_s
     DEADLINE = "deadline"  # the deadline passed before the work could start
@@ -432,6 +546,7 @@ class ErrorReply(Message, frozen=True, kw_only=True):
     message: str  # for people
     retryable: bool = False  # the same request may succeed later
     retry_after_s: WaitSeconds | None = None  # s, the least useful wait
+    reason: str | Absent = ABSENT  # finer than the code where it has several causes, e.g. duplicate
 
 
 ALL_MESSAGES: tuple[type[Message], ...] = (
@@ -445,11 +560,16 @@ ALL_MESSAGES: tuple[type[Message], ...] = (
     Occupancy,
     GridQuery,
     GridPart,
+    RaysQuery,
+    Rays,
+    RiskQuery,
+    Risk,
     ParamsQuery,
     ParamsPart,
-    AtomsQuery,
     AtomList,
     Atom,
+    AtomsQuery,
+    AtomsChanged,
     InfoQuery,
     Info,
     StatsQuery,

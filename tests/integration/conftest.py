@@ -258,6 +258,9 @@ class FakeMapper:
             timings_ms={},
         )
 
+    def use_dictionary(self, dictionary: AtomDictionary) -> None:
+        self.dictionary = dictionary
+
     def clear(self) -> None:
         self.snapshot = FakeSnapshot(self, KernelSet.empty(), self.snapshot.map_revision + 1)
         self.n_scans = 0

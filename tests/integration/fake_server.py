@@ -15,7 +15,7 @@ import zenoh
 
 from potclient.kernels import KernelSet
 from potschemas import messages
-from potschemas.keys import MapKeys, stats_key
+from potschemas.keys import QUERY_OPS, MapKeys, stats_key
 from potschemas.messages import ErrorCode, ReceiptStatus
 from potschemas.wire import MIME, decode, decode_array, encode, encode_array, encoding_of
 
@@ -86,6 +86,7 @@ class FakeServer:
         self.script = Script()
         self.script.receipt_gate.set()
         self.clouds: list[messages.Cloud] = []
+        self.atoms: list[messages.Atom] = []  # that were added
         self.poses: queue.Queue[messages.Pose] = queue.Queue()
         self.points = np.zeros((0, 3))
         self.revision = 0
@@ -107,7 +108,7 @@ class FakeServer:
         self._serve(
             self.session.declare_subscriber(k.pose("*"), zenoh.handlers.FifoChannel(64)), self._on_pose
         )
-        for op in ("integrate", "points", "grid", "params", "atoms", "info"):
+        for op in QUERY_OPS:
             self._queryable(k.query(op), op)
         for verb in ("clear", "drain"):
             self._queryable(k.control(verb), f"ctl-{verb}")
@@ -279,8 +280,14 @@ class FakeServer:
         status = self.script.receipts(cloud)
         return [] if status is None else [self._integrate(cloud, cloud.robot, status)]
 
-    def _occupancy(self, points: np.ndarray[Any, Any]) -> messages.Occupancy:
-        o = self._map().occupancy(points)
+    def _occupancy(self, points: np.ndarray[Any, Any], with_gradient: bool = False) -> messages.Occupancy:
+        o = self._map().occupancy(points, gradient=with_gradient)
+        gradients: dict[str, Any] = {}
+        if o.gradient is not None and o.latent_gradient is not None:
+            gradients = {
+                "gradient": encode_array(o.gradient),
+                "latent_gradient": encode_array(o.latent_gradient),
+            }
         return messages.Occupancy(
             mean=encode_array(o.mean),
             var=encode_array(o.var),
@@ -288,14 +295,53 @@ class FakeServer:
             latent_var=encode_array(o.latent_var),
             observed=encode_array(o.observed),
             map_revision=o.revision,
+            **gradients,
         )
 
     def _reply_points(self, payload: bytes) -> list[messages.Message]:
-        wire = decode(payload, messages.PointsQuery).points
+        ask = decode(payload, messages.PointsQuery)
+        wire = ask.points
         dtypes = (messages.DType.FLOAT32, messages.DType.FLOAT64)
         points = decode_array(wire, "points", dtypes=dtypes, shape=(None, (2, 3)))
         assert len(points) <= LIMITS.max_query_points
-        return [self._occupancy(points)]
+        return [self._occupancy(points, ask.with_gradient is True)]
+
+    def _reply_rays(self, payload: bytes) -> list[messages.Message]:
+        """Rays along x end a metre after their origin's x, whatever the map holds."""
+        ask = decode(payload, messages.RaysQuery)
+        n, n_quantiles = ask.origins.shape[0], len(ask.quantiles or ())
+        origins = decode_array(ask.origins, "origins", dtypes=(messages.DType.FLOAT64,), shape=(n, 3))
+        one = np.ones(n, np.float32)
+        return [
+            messages.Rays(
+                hit_probability=encode_array(0.5 * one),
+                mean_m=encode_array((origins[:, 0] + 1.0).astype(np.float32)),
+                std_m=encode_array(0.25 * one),
+                quantile_m=encode_array(np.ones((n, n_quantiles), np.float32)),
+                unknown_range_m=encode_array(np.nan * one),
+                unknown_share=encode_array(0 * one),
+                step_m=0.1,
+                map_revision=self.revision,
+            )
+        ]
+
+    def _reply_risk(self, payload: bytes) -> list[messages.Message]:
+        """A robot on pose i is at risk i / 10."""
+        n = decode(payload, messages.RiskQuery).path.shape[0]
+        risk = (np.arange(n) / 10).astype(np.float32)
+        return [
+            messages.Risk(
+                max_probability=encode_array(0.5 * risk),
+                union_probability=encode_array(risk),
+                unknown_share=encode_array(0 * risk),
+                path_max_probability=0.25,
+                path_union_probability=0.5,
+                path_unknown_share=0.125,
+                n_cells=100,
+                resolution_m=0.1,
+                map_revision=self.revision,
+            )
+        ]
 
     def _reply_grid(self, payload: bytes) -> list[messages.Message]:
         ask = decode(payload, messages.GridQuery)
@@ -358,6 +404,11 @@ class FakeServer:
 
     def _reply_atoms(self, payload: bytes) -> list[messages.Message]:
         ask = decode(payload, messages.AtomsQuery)
+        if ask.action is messages.AtomsAction.ADD:
+            self.atoms.append(ask.atom)
+            return [messages.AtomsChanged(atom_id=ask.atom.info.atom_id, n_atoms=2, persisted=True)]
+        if ask.action is messages.AtomsAction.REMOVE:
+            return [messages.AtomsChanged(atom_id=ask.atom_id, n_atoms=0, persisted=False)]
         if ask.atom_id is None:
             return [messages.AtomList(atoms=[self._atom_info()])]
         hits = np.ones((4, 3), np.float32)

@@ -10,14 +10,17 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 import zenoh
 
 from potclient import feed
+from potclient.atoms import Atom
 from potclient.client import MapClient, _query_qos
 from potclient.datasets import open_dataset
 from potclient.errors import (
+    AtomRefusedError,
     BadReplyError,
     ClosedError,
     IncompleteReplyError,
@@ -27,7 +30,9 @@ from potclient.errors import (
     OverloadedError,
     PotclientError,
     QueryTimeoutError,
+    ReadOnlyError,
     UsageError,
+    error_from_reply,
 )
 from potclient.holdout import HoldOut
 from potclient.kernels import KernelSet
@@ -37,7 +42,8 @@ from potclient.results import Receipt
 from potclient.session import SessionOptions
 from potschemas import messages
 from potschemas.messages import ErrorCode, ReceiptStatus
-from tests.integration.fake_server import FakeServer, free_port
+from potschemas.wire import decode, encode, encode_array
+from tests.integration.fake_server import FakeServer, free_port, kernels_of
 
 ROOT = Path(__file__).resolve().parents[2]
 LIMIT_S = 30.0  # of a wait that must succeed; no test measures it
@@ -359,6 +365,49 @@ def test_atoms_info_stats_and_control(client: MapClient) -> None:
     assert client.stats().server == client.stats("fake").server == "fake"
     assert client.control("clear").map_revision == 2
     assert client.info().n_kernels == 0
+
+
+def test_an_atom_travels_both_ways_unchanged(client: MapClient, server: FakeServer, tmp_path: Path) -> None:
+    fetched = client.atom("wall.1")
+    fetched.save(tmp_path / "wall.atom")
+    made = Atom.create(
+        "wall.2", fetched.hit_points.tolist(), fetched.free_points, Atom.load(tmp_path / "wall.atom").kernels,
+        dims=3, radius_m=10, azimuth_width_rad=1.2, provenance={"source": "fake"},
+    )  # fmt: skip
+    changed = client.add_atom(made)
+    assert (changed.atom_id, changed.n_atoms, changed.persisted) == ("wall.2", 2, True)
+    sent = server.atoms[-1]
+    assert sent.info == msgspec.structs.replace(fetched.info, atom_id="wall.2", times_used=0)
+    assert sent.hit_points == encode_array(fetched.hit_points)
+    assert sent.kernels == fetched.kernels.to_message()
+    assert not client.remove_atom("wall.2").persisted
+
+
+def test_a_refused_atom_is_a_typed_error_with_its_reason(client: MapClient, server: FakeServer) -> None:
+    atom = client.atom("wall.1")
+    server.script.fail_once["atoms"] = [ErrorCode.ATOM_REFUSED, ErrorCode.READ_ONLY]
+    with pytest.raises(AtomRefusedError):
+        client.add_atom(atom)
+    with pytest.raises(ReadOnlyError) as read_only:
+        client.remove_atom("wall.1")
+    assert read_only.value.reason is None
+    reply = messages.ErrorReply(code=ErrorCode.ATOM_REFUSED, message="a twin", reason="duplicate")
+    assert error_from_reply(decode(encode(reply), messages.ErrorReply)).reason == "duplicate"
+
+
+def test_arrays_that_are_no_atom(tmp_path: Path) -> None:
+    kernels = KernelSet.from_message(kernels_of(np.zeros((1, 3)), 0).to_message())
+    sector = {"dims": 3, "radius_m": 1.0, "azimuth_width_rad": 1.0}
+    for hits in (np.zeros((3, 2)), "no numbers", np.zeros(3)):
+        with pytest.raises(UsageError, match="hit_points"):
+            Atom.create("a", hits, np.zeros((1, 3)), kernels, **sector)
+    with pytest.raises(UsageError, match="dimensions"):
+        Atom.create("a", np.zeros((1, 3)), np.zeros((1, 3)), kernels, **sector | {"dims": 4})
+    with pytest.raises(UsageError, match="No such file"):
+        Atom.load(tmp_path / "none.atom")
+    (tmp_path / "x.atom").write_bytes(b"PK nonsense")
+    with pytest.raises(UsageError, match="potserver atoms export"):
+        Atom.load(tmp_path / "x.atom")
 
 
 def test_an_unknown_verb_is_not_a_missing_server(client: MapClient) -> None:

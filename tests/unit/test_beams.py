@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from potserver.numerics.beams import Beams, label_beams, limit_range
+from potserver.numerics.beams import Beams, LabelledPoints, beam_weights, label_beams, limit_range
 
 
 def _beams(n: int = 200, seed: int = 0, share_return: float = 0.7, longest: float = 20.0) -> Beams:
@@ -87,3 +87,14 @@ def test_range_limits() -> None:
 def test_a_beam_of_no_length_is_left_out_even_without_a_minimum() -> None:
     limited = limit_range(Beams(np.zeros((2, 3)), np.ones(2, bool)), 0.0, 10.0)
     assert limited.ends.shape == (0, 3)
+
+
+def test_a_beams_free_points_weigh_as_much_as_its_hit() -> None:
+    labelled = label_beams(_beams(), free_per_beam=3, gap_m=0.3, rng=np.random.default_rng(1))
+    weight = beam_weights(labelled)
+    np.testing.assert_array_equal(weight[labelled.occupied], 1.0)
+    free = ~labelled.occupied
+    per_beam = np.bincount(labelled.beam[free], weight[free])
+    np.testing.assert_allclose(per_beam[np.unique(labelled.beam[free])], 1.0)
+    none = LabelledPoints(np.zeros((0, 3)), np.zeros(0, bool), np.zeros(0, np.int64))
+    assert len(beam_weights(none)) == 0

@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 import zenoh
 
+from potclient.atoms import Atom
 from potclient.cli import build_parser, main
 from potclient.client import MapClient
 from potclient.errors import NoServerError, UsageError
-from potclient.kernels import KernelSet
 from potclient.session import (
     DEFAULT_ENDPOINT,
     SessionOptions,
@@ -28,7 +28,7 @@ from potclient.session import (
 from potschemas.messages import ErrorCode, ReceiptStatus
 from tests.integration.fake_server import FakeServer, free_port
 
-COMMANDS = ("publish", "query", "grid", "watch", "load", "info", "atoms", "control")
+COMMANDS = ("publish", "query", "grid", "rays", "risk", "export", "watch", "load", "info", "atoms", "control")
 
 
 @pytest.fixture(scope="module")
@@ -122,7 +122,12 @@ def test_wrong_usage_ends_with_status_2(words: list[str], capsys: pytest.Capture
             ["grid", "--resolution", "1", "--lower", "1", "1", "1", "--upper", "0", "0", "0", "-o", "x"],
             "lower",
         ),
-        (["atoms", "-o", "x.npz"], "name its ID"),
+        (["atoms", "-o", "x.atom"], "-o saves the atom"),
+        (["atoms", "list", "a"], "potclient atoms get a"),
+        (["atoms", "get"], "one ID"),
+        (["atoms", "add"], "name FILEs"),
+        (["atoms", "remove"], "name IDs"),
+        (["atoms", "add", "/nonexistent.atom"], "No such file"),
         (["info", "--map", "No Way"], "not an id"),
         (["info", "--cfg", "nonsense"], "KEY:VALUE"),
         (["info", "--cfg", "no/such/key:1"], "no/such/key"),
@@ -247,10 +252,17 @@ def test_info_atoms_and_control(run: Run, tmp_path: Path) -> None:
     status, out, _ = run("atoms")
     assert status == 0
     assert "wall.1" in out
-    status, out, _ = run("atoms", "wall.1", "-o", str(tmp_path / "k.npz"))
+    status, out, _ = run("atoms", "get", "wall.1", "-o", str(tmp_path / "wall.atom"))
     assert status == 0
     assert "source: fake" in out
-    assert len(KernelSet.load(tmp_path / "k.npz")) == 2
+    assert len(Atom.load(tmp_path / "wall.atom").kernels) == 2
+    status, out, _ = run("atoms", "add", str(tmp_path / "wall.atom"))
+    assert (status, out) == (0, "wall.1 added, 2 atoms, saved\n")
+    status, out, _ = run("atoms", "remove", "wall.1", "wall.2", "--json", "-")
+    assert status == 0
+    assert [change["atom_id"] for change in json.loads(out)] == ["wall.1", "wall.2"]
+    status, out, _ = run("atoms", "remove", "wall.1")
+    assert out == "wall.1 removed, 0 atoms, until the server restarts\n"
     status, out, _ = run("control", "clear")
     assert status == 0
     assert out.startswith("clear: cleared")
@@ -376,7 +388,7 @@ def test_load_fails_when_something_is_lost(run: Run, server: FakeServer) -> None
 
 def test_the_flags_of_all_commands_are_explained() -> None:
     parsers = next(a for a in build_parser()._actions if isinstance(a, argparse._SubParsersAction)).choices
-    assert set(parsers) == set(COMMANDS)
+    assert set(parsers) == {*COMMANDS, "town"}, "town needs no server; its help is tested with the towns"
 
 
 # --- sessions ------------------------------------------------------------------------------------------------------

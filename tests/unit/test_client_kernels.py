@@ -35,6 +35,7 @@ def kernels(k: int = 50, seed: int = 0, *, offset_m: float = 0.0, revision: int 
         observed_activation=0.05,
         prior_var=40.0,
         residual_var=20.0,
+        mean_moderation=0.25,
         map_revision=revision,
     )
 
@@ -57,7 +58,7 @@ def slow_answer(
     if not observed:
         mu, s2 = 0.0, ks.prior_var
     scale = 1.0 / math.sqrt(1.0 + math.pi * s2 / 8.0)
-    mean = 1.0 / (1.0 + math.exp(-mu * scale))
+    mean = 1.0 / (1.0 + math.exp(-mu / math.sqrt(1.0 + ks.mean_moderation * math.pi * s2 / 8.0)))
     return mean, mean * (1.0 - mean) * (1.0 - scale), mu, s2, observed
 
 
@@ -280,6 +281,15 @@ def test_the_split_depends_on_the_seed_alone() -> None:
     np.testing.assert_array_equal(a.points, b.points)
     assert len(a) != len(c) or not np.array_equal(a.points, c.points)
     assert len(LabelledPoints.concatenate([])) == 0
+
+
+def test_what_is_held_out_of_a_scan_depends_on_its_number_alone() -> None:
+    in_turn = HoldOut(0.2, seed=1)
+    scans = [scan(), scan(), scan()]
+    splits = [in_turn.split(s)[1].points for s in scans]
+    alone = HoldOut(0.2, seed=1).split(scans[2], 2)[1].points
+    np.testing.assert_array_equal(splits[2], alone)
+    assert not np.array_equal(splits[0], alone)
 
 
 @pytest.mark.parametrize("fraction", [0.0, 1.0, -1.0, math.nan])

@@ -6,6 +6,7 @@ import inspect
 from collections.abc import Callable
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 from hypothesis import given
@@ -16,10 +17,19 @@ from potschemas.messages import DType, ErrorCode, ReceiptStatus
 from potserver import errors
 from potserver.adapters import codec
 from potserver.adapters.limits import Limits
-from potserver.domain.types import AnswerRule, KernelSet, MapUpdate, Occupancy, Scan, SectorMatch, TileChange
+from potserver.domain.types import (
+    AnswerRule,
+    Atom,
+    KernelSet,
+    MapUpdate,
+    Occupancy,
+    Scan,
+    SectorMatch,
+    TileChange,
+)
 from potserver.errors import PotserverError, error_classes
 
-RULE = AnswerRule(observed_activation=0.05, prior_var=50.0, residual_var=20.0)
+RULE = AnswerRule(observed_activation=0.05, prior_var=50.0, residual_var=20.0, mean_moderation=0.25)
 LIMITS = Limits(max_cloud_bytes=10_000, max_cloud_points=100, max_query_points=50, max_coordinate_m=1000.0)
 
 
@@ -208,7 +218,8 @@ def test_random_bytes_are_only_ever_typed_errors(payload: bytes) -> None:
         lambda p: codec.decode_points_query(p, LIMITS),
         codec.decode_grid_query,
         codec.decode_params_query,
-        codec.decode_atoms_query,
+        lambda p: codec.decode_atoms_query(p, LIMITS),
+        codec.read_atom_file,
         codec.decode_info_query,
         codec.decode_stats_query,
         codec.decode_control,
@@ -249,7 +260,7 @@ def test_sizes_encodings_and_ids() -> None:
 def test_an_empty_payload_is_a_message_of_defaults() -> None:
     codec.decode_info_query(b"")
     codec.decode_stats_query(b"")
-    assert codec.decode_atoms_query(b"") is None
+    assert codec.decode_atoms_query(b"", LIMITS) == (messages.AtomsAction.READ, None, None)
     assert codec.decode_params_query(b"") == (None, None, None)
     assert codec.decode_control(b"") is None
     with pytest.raises(errors.BadMessageError):
@@ -269,6 +280,119 @@ def test_points_queries_are_bounded() -> None:
         codec.decode_points_query(query(np.ones((51, 3))), LIMITS)
     with pytest.raises(errors.OutOfRangeError):
         codec.decode_points_query(query(np.full((1, 3), 2000.0)), LIMITS)
+
+
+def atom(**changes: Any) -> Atom:
+    fields: dict[str, Any] = {
+        "atom_id": "wall.1",
+        "dims": 3,
+        "hit_points": np.ones((5, 3), np.float32),
+        "free_points": np.zeros((2, 3), np.float32),
+        "kernels": kernels(6),
+        "radius_m": 20.0,
+        "azimuth_width_rad": 1.0,
+        "provenance": {"source": "tests"},
+    }
+    return Atom(**fields | changes)
+
+
+def atom_message(of: Atom, **changes: Any) -> messages.Atom:
+    message = wire.decode(codec.encode_atom(of, {"wall.1": 3}, RULE).payload, messages.Atom)
+    return msgspec.structs.replace(message, **changes)
+
+
+def adding(message: messages.Atom, **changes: Any) -> bytes:
+    return wire.encode(messages.AtomsQuery(action=messages.AtomsAction.ADD, atom=message, **changes))
+
+
+def test_an_atom_to_be_added_comes_back_as_it_was() -> None:
+    sent = atom()
+    request = codec.decode_atoms_query(adding(atom_message(sent)), LIMITS)
+    assert (request.action, request.atom_id) == (messages.AtomsAction.ADD, None)
+    received = request.atom
+    assert received is not None
+    for name in ("atom_id", "dims", "radius_m", "azimuth_width_rad", "provenance"):
+        assert getattr(received, name) == getattr(sent, name)
+    for name in ("hit_points", "free_points"):
+        np.testing.assert_array_equal(getattr(received, name), getattr(sent, name))
+    np.testing.assert_allclose(received.kernels.hinge_mean, sent.kernels.hinge_mean, atol=2e-6, rtol=0)
+    for name in ("hinge_var", "gamma_shape", "gamma_rate", "weight_mean", "weight_var"):
+        np.testing.assert_array_equal(getattr(received.kernels, name), getattr(sent.kernels, name))
+    again = codec.read_atom_file(codec.encode_atom(sent, {}, RULE).payload)
+    np.testing.assert_array_equal(again.kernels.hinge_mean, received.kernels.hinge_mean)
+
+
+def test_what_may_be_asked_of_the_atoms() -> None:
+    def asked(**fields: Any) -> codec.AtomsRequest:
+        return codec.decode_atoms_query(wire.encode(messages.AtomsQuery(**fields)), LIMITS)
+
+    action = messages.AtomsAction
+    assert asked(atom_id="a") == asked(atom_id="a", action=action.READ) == (action.READ, "a", None)
+    assert asked(atom_id="a", action=action.REMOVE) == (action.REMOVE, "a", None)
+    whole = atom_message(atom())
+    assert asked(atom_id="wall.1", action=action.ADD, atom=whole).atom is not None
+    for fields in (
+        {"action": action.REMOVE},
+        {"action": action.ADD},
+        {"action": action.ADD, "atom_id": "a"},
+        {"action": action.ADD, "atom": whole, "atom_id": "other"},
+        {"action": action.READ, "atom": whole},
+        {"atom": whole},
+        {"action": action.REMOVE, "atom_id": "wall.1", "atom": whole},
+    ):
+        with pytest.raises(errors.BadMessageError):
+            asked(**fields)
+
+
+def test_an_unsound_atom_is_a_typed_error() -> None:
+    whole = atom_message(atom())
+    for message, error in (
+        (atom_message(atom(), hit_points=wire.encode_array(np.ones((4, 3), np.float32))), errors.ShapeError),
+        (atom_message(atom(), hit_points=wire.encode_array(np.ones((5, 2), np.float32))), errors.ShapeError),
+        (
+            atom_message(atom(), hit_points=wire.encode_array(np.full((5, 3), np.nan, np.float32))),
+            errors.BadPointsError,
+        ),
+        (atom_message(atom(), hit_points=wire.encode_array(np.full((5, 3), 1e300))), errors.BadPointsError),
+        (atom_message(atom(free_points=np.zeros((51, 3), np.float32))), errors.TooLargeError),
+        (
+            msgspec.structs.replace(
+                whole,
+                kernels=msgspec.structs.replace(
+                    whole.kernels, gamma_rate=wire.encode_array(np.zeros(6, np.float32))
+                ),
+            ),
+            errors.ShapeError,
+        ),
+        (
+            msgspec.structs.replace(
+                whole,
+                kernels=msgspec.structs.replace(
+                    whole.kernels, weight_var=wire.encode_array(np.ones(5, np.float32))
+                ),
+            ),
+            errors.ShapeError,
+        ),
+    ):
+        with pytest.raises(error):
+            codec.decode_atoms_query(adding(message), LIMITS)
+    with pytest.raises(errors.TooLargeError):
+        codec.decode_atoms_query(adding(whole), Limits(max_query_bytes=100))
+
+
+@given(st.data())
+def test_a_changed_byte_of_an_atom_is_an_atom_or_a_typed_error(data: st.DataObject) -> None:
+    payload = bytearray(adding(atom_message(atom())))
+    payload[data.draw(st.integers(0, len(payload) - 1))] = data.draw(st.integers(0, 255))
+    assert outcome(lambda p: codec.decode_atoms_query(p, LIMITS), bytes(payload)) != "internal"
+
+
+def test_a_reason_travels_and_none_leaves_the_bytes_as_they_were() -> None:
+    refused = codec.encode_error(errors.AtomRefusedError("because", reason="duplicate"))
+    assert wire.decode(refused.payload, messages.ErrorReply).reason == "duplicate"
+    plain = codec.encode_error(errors.EmptyError("because"))
+    assert b"reason" not in plain.payload
+    assert wire.decode(plain.payload, messages.ErrorReply).reason is messages.ABSENT
 
 
 # --- out ----------------------------------------------------------------------------------------------------

@@ -7,7 +7,7 @@ import threading
 import numpy as np
 import pytest
 
-from potserver.domain.kernel_map import OBSERVED_ACTIVATION, PRIOR_VAR, KernelMap, as_points
+from potserver.domain.kernel_map import OBSERVED_ACTIVATION, PRIOR_VAR, IndexedKernels, KernelMap, as_points
 from potserver.domain.types import KernelSet
 from potserver.errors import BadPointsError, ShapeError
 
@@ -141,3 +141,30 @@ def test_many_threads_may_ask_at_once() -> None:
         thread.join()
     for answer in answers:
         np.testing.assert_array_equal(answer, truth)
+
+
+def test_parts_answer_like_the_whole() -> None:
+    rng = np.random.default_rng(0)
+    whole = KernelMap.from_arrays(
+        rng.uniform(-60, 60, (4000, 3)) * [1, 1, 0.1],
+        rng.uniform(0.1, 4, 4000),
+        rng.normal(0, 4, 4000),
+        rng.uniform(0, 2, 4000),
+    )
+    part_of = np.floor(whole.kernels.hinge_mean[:, 0] / 25.0).astype(int)
+    parts = [IndexedKernels.of(whole.kernels.take(part_of == n), 0.05) for n in (*np.unique(part_of), 99)]
+    together = KernelMap(parts, map_revision=3, threads=2)
+    points = np.concatenate([rng.uniform(-70, 70, (5000, 3)) * [1, 1, 0.1], whole.kernels.hinge_mean[:500]])
+    one, other = whole.occupancy(points), together.occupancy(points)
+    np.testing.assert_allclose(one.mean, other.mean, atol=2e-4)
+    np.testing.assert_allclose(one.latent_var, other.latent_var, rtol=1e-2, atol=1e-2)
+    assert (one.observed == other.observed).mean() > 0.999
+    assert len(together) == len(together.kernels) == 4000
+    alone = together.occupancy(points[:1])
+    np.testing.assert_allclose(alone.mean, other.mean[:1], atol=1e-6)
+
+
+def test_a_map_of_no_parts_knows_nothing() -> None:
+    empty = KernelMap([])
+    assert len(empty) == len(empty.kernels) == 0
+    assert not empty.occupancy(np.zeros((3, 3))).observed.any()

@@ -172,6 +172,41 @@ def test_a_prior_that_is_far_off_is_overcome() -> None:
     assert case.objective(sparse.mean.astype(np.float64)) <= case.objective(dense.mean) + 0.05
 
 
+def test_a_good_start_is_begun_with() -> None:
+    case = Case(150, 1500, prior_var=100.0)
+    best = case.sparse()
+    again = case.sparse(start=best.mean, tolerance=1e-3)
+    assert again.converged
+    assert again.n_newton <= 2 < best.n_newton
+    np.testing.assert_allclose(case.phi @ again.mean, case.phi @ best.mean, atol=0.01)
+    nudged = best.mean + np.float32(0.05) * np.random.default_rng(0).normal(size=150).astype(np.float32)
+    one_step = {"max_newton": 1, "max_conjugate_gradient": 30}
+    assert case.objective(case.sparse(start=nudged, **one_step).mean) < case.objective(
+        case.sparse(**one_step).mean
+    )
+
+
+@pytest.mark.parametrize("size", [30.0, -500.0])
+def test_a_start_worse_than_the_priors_plays_no_part(size: float) -> None:
+    case = Case()
+    start = np.full(40, size, np.float32)
+    bad, without = case.sparse(start=start), case.sparse()
+    np.testing.assert_array_equal(bad.mean, without.mean)
+    assert bad.n_newton == without.n_newton
+    np.testing.assert_array_equal(start, np.float32(size))
+
+
+def test_the_start_only_starts() -> None:
+    """Neither the optimum nor the given array changes."""
+    case = Case()
+    start = case.sparse().mean + np.float32(0.3)
+    kept = start.copy()
+    np.testing.assert_allclose(
+        case.phi @ case.sparse(start=start).mean, case.phi @ case.sparse().mean, atol=1e-3
+    )
+    np.testing.assert_array_equal(start, kept)
+
+
 def test_a_solve_cut_short_says_so() -> None:
     case = Case(150, 1500, prior_var=100.0)
     assert not case.sparse(max_newton=1).converged

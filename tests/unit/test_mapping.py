@@ -52,6 +52,31 @@ def _service(profile: str = "default", dictionary: AtomDictionary | None = None,
     return MappingService(dictionary, settings, threads=2)
 
 
+def test_a_new_dictionary_counts_from_the_next_scan_on() -> None:
+    builtin = AtomDictionary.builtin()
+    deep = builtin.of_dims(3).atoms
+    one, other = AtomDictionary(deep[:1]), AtomDictionary(deep[-1:])
+    service = _service(dictionary=one)
+    scan = _room_scan()
+
+    class InWork:
+        """Matches as the first dictionary would, and swaps the dictionary in the middle of the scan."""
+
+        def __init__(self, matcher) -> None:
+            self._matcher = matcher
+
+        def match(self, sectors):
+            service.use_dictionary(other)
+            return self._matcher.match(sectors)
+
+    service._atoms.matchers[3] = InWork(service._atoms.matchers[3])
+    first, second = service.integrate(scan), service.integrate(_room_scan(x=0.3))
+    assert service.dictionary is other
+    assert {match.atom_id for match in first.sectors} - {None} == {deep[0].atom_id}
+    assert {match.atom_id for match in second.sectors} - {None} == {deep[-1].atom_id}
+    assert service.snapshot.map_revision == 2
+
+
 def _test_points(scan: Scan, seed: int = 9) -> tuple[np.ndarray, np.ndarray]:
     """Held-out beams of a scan: each end, and one uniform point at least 0.5 m before it (DESIGN section 6)."""
     rng = np.random.default_rng(seed)
@@ -94,7 +119,8 @@ def test_both_profiles_map_a_room(profile: str, planar: bool) -> None:
     assert service.n_scans == 3
     assert sum(service.atom_usage.values()) >= 3
     points, occupied = _test_points(_room_scan(x=0.7, seed=77, planar=planar, n=200))
-    assert service.snapshot.occupancy(points).observed.mean() > (0.8 if profile == "default" else 0.5)
+    # pure transport moves the atoms of streets into this room, and covers a part of it
+    assert service.snapshot.occupancy(points).observed.mean() > (0.8 if profile == "default" else 0.25)
     if profile == "default":
         assert ((service.snapshot.occupancy(points).mean > 0.5) == occupied).mean() > 0.9
         assert _nll(service.snapshot, points, occupied) < 0.4
@@ -216,8 +242,8 @@ def test_planar_scans_keep_their_kernels_in_their_plane(profile: str, height: fl
 
 @pytest.mark.parametrize("profile", list(PROFILES))
 def test_maps_at_utm_coordinates_are_the_same_maps(profile: str) -> None:
-    """A shift by multiples of every grid of kernels: 0.3 m and 1 m."""
-    shift = (500_001.0, 4_100_001.0, 120.0)
+    """A shift by whole tiles, which every grid of kernels divides."""
+    shift = (500_010.0, 4_100_010.0, 120.0)
     here, there = _service(profile), _service(profile)
     for k in range(2):
         here.integrate(_room_scan(x=0.5 * k, seed=k))

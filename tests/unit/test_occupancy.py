@@ -35,6 +35,17 @@ def test_more_variance_pulls_the_mean_towards_one_half() -> None:
     assert np.abs(predict_occupancy(np.array([10.0]), np.array([1e12])).mean - 0.5) < 1e-4
 
 
+def test_the_moderation_scales_the_variance_for_the_mean_alone() -> None:
+    part = predict_occupancy(MEAN, VAR, 0.25)
+    np.testing.assert_allclose(part.mean, predict_occupancy(MEAN, 0.25 * VAR).mean)
+    np.testing.assert_allclose(predict_occupancy(MEAN, VAR, 0.0).mean, sigmoid(MEAN))
+    mean, var = MEAN[:, 50:71], VAR[:, 50:71]  # elsewhere p rounds to 0 or 1
+    part, full = predict_occupancy(mean, var, 0.25), predict_occupancy(mean, var)
+    np.testing.assert_allclose(
+        part.var / (part.mean * (1 - part.mean)), full.var / (full.mean * (1 - full.mean)), atol=1e-9
+    )
+
+
 def test_all_uncertain_is_the_variance_of_a_coin() -> None:
     assert predict_occupancy(np.zeros(1), np.array([1e12])).var[0] == pytest.approx(0.25, abs=1e-5)
 

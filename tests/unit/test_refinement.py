@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import numpy as np
 import pytest
 
@@ -14,15 +12,10 @@ from potserver.numerics.beams import LabelledPoints
 from potserver.numerics.logistic import WeightPosterior
 from potserver.services.refinement import (
     activation,
-    fill_kernels,
     gamma_of_spacing,
-    is_fine,
     place_kernels,
     refine,
 )
-from potserver.services.settings import MappingSettings
-
-SETTINGS = MappingSettings()
 
 
 def _labelled(n: int = 600, seed: int = 0, planar: bool = False) -> LabelledPoints:
@@ -34,8 +27,16 @@ def _labelled(n: int = 600, seed: int = 0, planar: bool = False) -> LabelledPoin
     return LabelledPoints(np.stack([x, rng.uniform(-4, 4, n), z], axis=1), occupied, np.arange(n))
 
 
+def _placed(labelled: LabelledPoints) -> KernelSet:
+    """Coarse kernels anywhere, fine ones at hits."""
+    hits = labelled.points[labelled.occupied]
+    return KernelSet.concatenate([place_kernels(labelled.points, 1.0, 50.0), place_kernels(hits, 0.3, 50.0)])
+
+
 def _refine(kernels: KernelSet, labelled: LabelledPoints, tolerance: float = 1e-4) -> KernelSet:
-    return refine(kernels, labelled, feature_cut=0.01, tolerance=tolerance, threads=1).kernels
+    return refine(
+        kernels, labelled.points, labelled.occupied, feature_cut=0.01, tolerance=tolerance, threads=1
+    ).kernels
 
 
 @pytest.mark.parametrize("offset", [0.0, -7.3, 4e6])
@@ -61,29 +62,6 @@ def test_nothing_to_place() -> None:
     assert len(place_kernels(np.zeros((0, 3)), 0.5, 1.0)) == 0
 
 
-def test_filling_explains_every_point_and_then_adds_no_more() -> None:
-    labelled = _labelled()
-    first = fill_kernels(labelled, KernelSet.empty(), SETTINGS, threads=1)
-    assert len(first)
-    assert is_fine(first, SETTINGS).any()
-    assert not is_fine(first, SETTINGS).all()
-    more = fill_kernels(labelled, first, SETTINGS, threads=1)
-    assert len(more) < 0.6 * len(first)
-    fine = first.take(is_fine(first, SETTINGS))
-    assert (np.abs(fine.hinge_mean[:, 0] - 5.0) < SETTINGS.fill_fine_m).all(), "fine kernels lie at hits"
-    dense = KernelSet.concatenate([first] * 8)
-    assert len(fill_kernels(labelled, dense, SETTINGS, threads=1)) == 0
-
-
-def test_filling_switched_off() -> None:
-    off = dataclasses.replace(SETTINGS, fill_coarse_m=0.0, fill_fine_m=0.0)
-    assert len(fill_kernels(_labelled(), KernelSet.empty(), off, threads=1)) == 0
-    coarse_only = dataclasses.replace(SETTINGS, fill_fine_m=0.0)
-    assert not is_fine(
-        fill_kernels(_labelled(), KernelSet.empty(), coarse_only, threads=1), coarse_only
-    ).any()
-
-
 def test_activation_is_the_sum_of_phi() -> None:
     rng = np.random.default_rng(0)
     kernels = place_kernels(rng.uniform(-3, 3, (80, 3)), 0.6, 1.0)
@@ -95,7 +73,7 @@ def test_activation_is_the_sum_of_phi() -> None:
 
 def test_refined_kernels_tell_wall_from_free_space_on_points_they_did_not_see() -> None:
     labelled = _labelled()
-    refined = _refine(fill_kernels(labelled, KernelSet.empty(), SETTINGS, threads=1), labelled)
+    refined = _refine(_placed(labelled), labelled)
     held_out = _labelled(seed=1)
     p = KernelMap(refined).occupancy(held_out.points).mean
     assert ((p > 0.5) == held_out.occupied).mean() > 0.97
@@ -103,7 +81,7 @@ def test_refined_kernels_tell_wall_from_free_space_on_points_they_did_not_see() 
 
 def test_only_the_weights_change() -> None:
     labelled = _labelled()
-    before = fill_kernels(labelled, KernelSet.empty(), SETTINGS, threads=1)
+    before = _placed(labelled)
     after = _refine(before, labelled)
     for name in ("hinge_mean", "hinge_var", "gamma_shape", "gamma_rate"):
         np.testing.assert_array_equal(getattr(before, name), getattr(after, name))
@@ -122,7 +100,7 @@ def test_the_prior_is_kept_where_there_are_no_data() -> None:
 
 def test_a_surer_prior_moves_less() -> None:
     labelled = _labelled()
-    placed = fill_kernels(labelled, KernelSet.empty(), SETTINGS, threads=1)
+    placed = _placed(labelled)
     moved = [
         float(
             np.abs(
@@ -134,31 +112,39 @@ def test_a_surer_prior_moves_less() -> None:
     assert moved[0] < moved[1] < moved[2]
 
 
+def test_a_point_of_weight_two_is_two_points() -> None:
+    labelled = _labelled()
+    placed = _placed(labelled)
+    twice = np.concatenate([labelled.points, labelled.points]), np.concatenate([labelled.occupied] * 2)
+    options = {"feature_cut": 0.01, "tolerance": 1e-4, "threads": 1}
+    one = refine(
+        placed, labelled.points, labelled.occupied, sample_weight=np.full(600, 2.0, np.float32), **options
+    ).kernels
+    other = refine(placed, *twice, **options).kernels
+    np.testing.assert_allclose(one.weight_mean, other.weight_mean, atol=0.02)
+
+
 def test_nothing_to_refine() -> None:
     assert len(_refine(KernelSet.empty(), _labelled())) == 0
 
 
 def test_weights_that_are_not_numbers_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     labelled = _labelled()
-    placed = fill_kernels(labelled, KernelSet.empty(), SETTINGS, threads=1)
+    placed = _placed(labelled)
     nan = np.full(len(placed), np.nan, np.float32)
     bad = WeightPosterior(nan, nan, 1, 1, 1.0, False)
     monkeypatch.setattr("potserver.services.refinement.fit_sparse", lambda *_, **__: bad)
     with pytest.raises(SolverError, match="NaN"):
-        refine(placed, labelled, feature_cut=0.01, tolerance=0.1, threads=1)
+        refine(placed, labelled.points, labelled.occupied, feature_cut=0.01, tolerance=0.1, threads=1)
 
 
 def test_the_weights_do_not_depend_on_the_number_of_threads() -> None:
     labelled = _labelled()
-    placed = fill_kernels(labelled, KernelSet.empty(), SETTINGS, threads=1)
+    placed = _placed(labelled)
     one, three = (
-        refine(placed, labelled, feature_cut=0.01, tolerance=0.03, threads=n).kernels for n in (1, 3)
+        refine(
+            placed, labelled.points, labelled.occupied, feature_cut=0.01, tolerance=0.03, threads=n
+        ).kernels
+        for n in (1, 3)
     )
     np.testing.assert_array_equal(one.weight_mean, three.weight_mean)
-
-
-def test_kernels_much_wider_than_the_coarse_ones_explain_nothing() -> None:
-    labelled = _labelled()
-    wide = place_kernels(labelled.points, 8.0, 50.0)
-    without = fill_kernels(labelled, KernelSet.empty(), SETTINGS, threads=1)
-    assert len(fill_kernels(labelled, wide, SETTINGS, threads=1)) == len(without)

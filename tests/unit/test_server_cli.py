@@ -10,13 +10,17 @@ import signal
 import sys
 import types
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
+from potclient.atoms import Atom
 from potserver import cli
 from potserver.adapters.log import configure_logging, get_logger
 from potserver.config import Settings, load_settings
+from potserver.domain.dictionary import AtomDictionary
 
 
 @pytest.fixture(autouse=True)
@@ -91,8 +95,13 @@ def test_variables_are_read(capsys: pytest.CaptureFixture[str], monkeypatch: pyt
         (["config", "show", "--cfg", "mode"], "need KEY:VALUE"),
         (["config", "show", "--settings", "/no/such.toml"], "cannot read settings file"),
         (["config", "show", "--root", "**"], "chunks"),
-        (["atoms", "info", "/no/such.npz"], "no atom dictionary at"),
+        (["atoms", "info", "/no/such.atoms"], "no atom dictionary at"),
         (["atoms", "build", "-o", "x.npz"], "recordings to learn from"),
+        (["atoms", "info", "--picture", "/no/such/folder/x.png", "--limit", "0"], "cannot draw 0 atoms"),
+        (["atoms", "export", "nope", "-o", "x"], "no atom 'nope'"),
+        (["atoms", "import", "/no/such.atom", "-o", "/no/such.atoms"], "cannot read /no/such.atom"),
+        (["config", "show", "--set", "atoms.save=true"], "need the setting `dictionary`"),
+        (["config", "show", "--set", "atoms.admission.min_auc=nan"], "atoms.admission.min_auc"),
         (["serve", "--map", "A"], "is not an id"),
     ],
 )
@@ -108,7 +117,18 @@ def test_a_mistake_is_one_line_and_exit_code_two(
 
 
 @pytest.mark.parametrize(
-    "words", [[], ["serve"], ["config"], ["config", "show"], ["atoms"], ["atoms", "info"], ["atoms", "build"]]
+    "words",
+    [
+        [],
+        ["serve"],
+        ["config"],
+        ["config", "show"],
+        ["atoms"],
+        ["atoms", "info"],
+        ["atoms", "build"],
+        ["atoms", "export"],
+        ["atoms", "import"],
+    ],
 )
 def test_help_is_there_at_every_level(capsys: pytest.CaptureFixture[str], words: list[str]) -> None:
     with pytest.raises(SystemExit) as caught:
@@ -132,7 +152,41 @@ def test_atoms_info_lists_the_dictionary(capsys: pytest.CaptureFixture[str]) -> 
     assert cli.main(["atoms", "info"]) == 0
     text = capsys.readouterr().out
     assert text.splitlines()[-1].startswith(f"{len(atoms)} atoms, ")
-    assert atoms[0]["atom_id"] in text
+    head, first = text.splitlines()[:2]
+    assert head.split()[:8] == ["atom", "dims", "hits", "free", "kernels", "AUC", "NLL", "ECE"]
+    assert first.startswith(atoms[0]["atom_id"])
+    assert atoms[0]["provenance"]["held_out_auc"] in first
+
+
+def test_atoms_info_draws_a_picture(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    picture = tmp_path / "atoms.png"
+    assert cli.main(["atoms", "info", "--picture", str(picture), "--limit", "1"]) == 0
+    assert f"1 atoms drawn to {picture}" in capsys.readouterr().out
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    name = AtomDictionary.builtin().of_dims(2).atoms[0].atom_id
+    assert cli.main(["atoms", "info", "--picture", "/no/such/folder/x.png", "--atom", name]) == 2
+    assert "cannot write" in capsys.readouterr().err
+
+
+def test_atoms_leave_a_dictionary_and_come_back(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    builtin = AtomDictionary.builtin()
+    names = [atom.atom_id for atom in builtin][:2]
+    assert cli.main(["atoms", "export", *names, "-o", str(tmp_path / "out")]) == 0
+    files = [str(tmp_path / "out" / f"{name}.atom") for name in names]
+    assert Atom.load(files[0]).info.atom_id == names[0]  # robots read the same files
+    target = tmp_path / "mine.atoms"
+    assert cli.main(["atoms", "import", files[0], "-o", str(target)]) == 0
+    assert cli.main(["atoms", "import", files[1], "-o", str(target)]) == 0
+    back = AtomDictionary.load(target)
+    assert [atom.atom_id for atom in back] == names
+    np.testing.assert_allclose(
+        back.get(names[0]).kernels.hinge_mean, builtin.get(names[0]).kernels.hinge_mean, atol=2e-6
+    )
+    before = target.read_bytes()
+    capsys.readouterr()
+    assert cli.main(["atoms", "import", files[0], "-o", str(target)]) == 2
+    assert "the dictionary has an atom" in capsys.readouterr().err
+    assert target.read_bytes() == before
 
 
 def test_demo_is_handed_its_arguments(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -61,7 +61,8 @@ def test_the_paper_profile_is_what_the_authors_code_does() -> None:
     assert PAPER.out_of_sample.value == "nearest"
     assert not PAPER.keep_in_sector
     assert not PAPER.refine
-    assert PAPER.fill_coarse_m == PAPER.fill_fine_m == 0.0
+    assert (PAPER.free_per_beam, PAPER.beams_per_scan, PAPER.match_beams) == (2, 8_000, 8_000)
+    assert PAPER.mean_moderation == 1.0
 
 
 def test_settings_are_frozen() -> None:

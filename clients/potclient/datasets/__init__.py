@@ -1,7 +1,8 @@
 """Recordings to play into a map: `open_dataset` finds out what a path holds.
 
 Formats: `kitti` (odometry layout), `clouds` (a folder of PCD or PLY files with poses), `carmen` (2D laser logs), `generated`
-(a made-up scene; the path is `generated`, `generated:2d`, or either with `:SEED`).
+(a made-up yard; the path is `generated`, `generated:2d`, or either with `:SEED`), `town` (a drive through a made-up town, see
+`potclient.towns`; the path is `town:STYLE[:2d][:dynamic][:SENSOR][:LENGTHm][:SEED]`).
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ __all__ = [
     "open_dataset",
 ]
 
-FORMATS = ("auto", "kitti", "clouds", "carmen", "generated")
+FORMATS = ("auto", "kitti", "clouds", "carmen", "generated", "town")
 
 
 def open_dataset(
@@ -42,16 +43,19 @@ def open_dataset(
     """Open a recording; slice it to take fewer scans, e.g. `open_dataset(path)[::2]`.
 
     Args:
-        path: A folder or file, or `generated[:2d][:SEED]`.
+        path: A folder or file, `generated[:2d][:SEED]`, or `town:STYLE[:2d][:dynamic][:SENSOR][:LENGTHm][:SEED]`.
         format: One of `FORMATS`; "auto" looks at what is there.
         poses: Pose file to use instead of the usual one.
         frame: For PCD files: where their points are, see `CloudFolder`.
         no_return_m: For CARMEN logs: readings from here on are no echoes (default 50).
         min_range_m: Points nearer than this are dropped.
         max_range_m: Beams beyond this are cut: free up to there, no echo (CARMEN logs: 30 unless given).
-        n_generated: How many scans a generated scene has.
+        n_generated: How many scans a generated scene or a town without a length has.
+
+    Returns:
+        The recording; a town's is a `potclient.towns.TownRecording`, whose `town` knows the truth.
     Raises:
-        DatasetError: nothing there, not recognised, or damaged.
+        DatasetError: nothing there, not recognised, or damaged; or a town without open3d.
     """
     if format not in FORMATS:
         raise DatasetError(f"format {format!r}: need one of {', '.join(FORMATS)}")
@@ -60,6 +64,10 @@ def open_dataset(
     pose_file = None if poses is None else Path(poses)
     if format == "generated" or (format == "auto" and str(path).partition(":")[0] == "generated"):
         return _limited(_generated(str(path), n_generated), min_range_m, max_range_m)
+    if format == "town" or (format == "auto" and str(path).partition(":")[0] == "town"):
+        from potclient.towns import open_town
+
+        return open_town(str(path), n_scans=n_generated, min_range_m=min_range_m, max_range_m=max_range_m)
     path = Path(path)
     if not path.exists():
         raise DatasetError(f"{path}: no such file or folder")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -9,8 +10,9 @@ import numpy as np
 
 from potclient.datasets.scans import RecordedScan, Recording, natural_key, read_poses, read_stamps
 from potclient.errors import DatasetError
-from potclient.results import Float32, Float64
+from potclient.results import Bool, Float32, Float64
 
+RECORDING_FILE = "recording.json"
 FRAMES = ("auto", "sensor", "world")
 
 
@@ -18,7 +20,9 @@ class CloudFolder(Recording):
     """A folder of .pcd or .ply files in natural order (scan_2 before scan_10), or a single file.
 
     Args:
-        path: The folder or file. `poses.txt` in it gives T_map_sensor a line; `times.txt` seconds a line.
+        path: The folder or file. `poses.txt` in it gives T_map_sensor a line; `times.txt` seconds a line; `recording.json`
+            with `"is_planar": true` says that a 2D scanner took the scans (z = 0). Where the files have a field `is_return`,
+            points with 0 there are beams without an echo, free up to the point.
         poses: Another pose file; relative names are looked up in the folder first.
         frame: Where the points are. "sensor": sensor frame. "world": the map frame already, and the header's VIEWPOINT is only
             the place of the sensor. "auto": sensor if there are poses, else world if a VIEWPOINT is not the origin.
@@ -62,6 +66,7 @@ class CloudFolder(Recording):
             self.notes = ("no poses.txt: the one scan is at the origin",)
         else:
             raise DatasetError(f"{path}: no poses.txt; name a pose file with --poses")
+        self._is_planar = path.is_dir() and _is_planar(folder / RECORDING_FILE)
         self._stamps = read_stamps(folder / "times.txt" if path.is_dir() else None, n)
 
     def __len__(self) -> int:
@@ -69,17 +74,18 @@ class CloudFolder(Recording):
 
     def read(self, i: int) -> RecordedScan:
         file = self._files[i]
-        points = read_cloud(file)
+        points, is_return = read_beams(file)
         pose = read_viewpoint(file) if self._poses is None else self._poses[i]
         if self._points_in_world:
             points = ((points.astype(np.float64) - pose[:3, 3]) @ pose[:3, :3]).astype(np.float32)
-        points = points[np.isfinite(points).all(axis=1)]
+        finite = np.isfinite(points).all(axis=1)
         return RecordedScan(
-            points=np.ascontiguousarray(points),
-            is_return=np.ones(len(points), np.bool_),
+            points=np.ascontiguousarray(points[finite]),
+            is_return=is_return[finite],
             T_map_sensor=pose,
             stamp_ns=self._stamps[i],
             name=file.name,
+            is_planar=self._is_planar,
         )
 
 
@@ -94,10 +100,31 @@ def read_cloud(path: Path) -> Float32:
     Raises:
         DatasetError: not such a file, truncated, or without x y z.
     """
+    return read_beams(path)[0]
+
+
+def read_beams(path: Path) -> tuple[Float32, Bool]:
+    """(N, 3) m and (N,): the points of a file as `read_cloud`, and whether each is an echo (all are, without `is_return`).
+
+    Raises:
+        DatasetError: as `read_cloud`.
+    """
     return _read_pcd(path) if path.suffix.lower() == ".pcd" else _read_ply(path)
 
 
-def _read_pcd(path: Path) -> Float32:
+def _is_planar(path: Path) -> bool:
+    if not path.is_file():
+        return False
+    try:
+        is_planar = json.loads(path.read_text()).get("is_planar", False)
+    except (OSError, ValueError, AttributeError) as error:
+        raise DatasetError(f"{path}: need a JSON object ({error})") from error
+    if not isinstance(is_planar, bool):
+        raise DatasetError(f"{path}: is_planar must be true or false, not {is_planar!r}")
+    return is_planar
+
+
+def _read_pcd(path: Path) -> tuple[Float32, Bool]:
     try:
         from pypcd4 import PointCloud
     except ImportError as error:
@@ -111,10 +138,10 @@ def _read_pcd(path: Path) -> Float32:
     data = np.atleast_1d(cloud.pc_data)
     if len(data) != cloud.metadata.points:
         raise DatasetError(f"{path}: truncated, {len(data)} of {cloud.metadata.points} points")
-    return _xyz(path, data, tuple(data.dtype.names or ()))
+    return _beams(path, data, tuple(data.dtype.names or ()))
 
 
-def _read_ply(path: Path) -> Float32:
+def _read_ply(path: Path) -> tuple[Float32, Bool]:
     try:
         from plyfile import PlyData
     except ImportError as error:
@@ -125,13 +152,16 @@ def _read_ply(path: Path) -> Float32:
         raise DatasetError(f"{path}: cannot be read ({error.strerror or error})") from error
     except Exception as error:  # plyfile raises whatever its parsers raise
         raise DatasetError(f"{path}: not a readable PLY file with vertices ({_short(error)})") from error
-    return _xyz(path, data, tuple(data.dtype.names or ()))
+    return _beams(path, data, tuple(data.dtype.names or ()))
 
 
-def _xyz(path: Path, data: Any, names: tuple[str, ...]) -> Float32:
+def _beams(path: Path, data: Any, names: tuple[str, ...]) -> tuple[Float32, Bool]:
     if not {"x", "y", "z"} <= set(names):
         raise DatasetError(f"{path}: fields {' '.join(names)}, need x y z")
-    return np.stack([np.asarray(data[axis], np.float32) for axis in "xyz"], axis=1)
+    points = np.stack([np.asarray(data[axis], np.float32) for axis in "xyz"], axis=1)
+    if "is_return" not in names:
+        return points, np.ones(len(points), np.bool_)
+    return points, np.asarray(data["is_return"]) != 0
 
 
 def read_viewpoint(path: Path) -> Float64:

@@ -1,0 +1,234 @@
+"""How good learned kernels are for their number, against a grid of fixed kernels with jointly solved weights.
+
+    python benchmarks/learner_curves.py town:downtown:5 DATASET... [--scans 0,20] [--window 1] [-o docs/learner.png]
+
+Both get the same labels and sample weights of the same sectors, and both are scored on the held-out beams of these sectors.
+The grid is a lattice over the data with a length scale of 0.75 spacings and the learner's own prior. "Favoured" is a grid whose
+prior variance is the best of three by those very held-out beams.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from rich.console import Console
+from rich.progress import track
+from rich.table import Table
+
+from potclient.datasets import Recording, open_dataset
+from potclient.holdout import HoldOut
+from potclient.metrics import Metrics, score
+from potserver.atom_builder.scan_task import SectorOf, to_scan
+from potserver.domain.kernel_map import KernelMap
+from potserver.numerics.kernel_index import sparse_features
+from potserver.numerics.logistic import fit_sparse
+from potserver.services.learning import LearningSettings, beam_weights, cut_sectors, lattice, learn_kernels
+
+_GRID_LENGTH = 0.75  # spacings
+_POINTS_PER_KERNEL = 4  # at least, for both: sectors with few points get fewer kernels
+_FAVOURED_PRIORS = (20.0, 50.0, 200.0)
+
+
+class Sector(NamedTuple):
+    points: np.ndarray
+    occupied: np.ndarray
+    test_points: np.ndarray
+    test_occupied: np.ndarray
+
+
+def main() -> int:
+    options = _options()
+    settings = LearningSettings(n_sectors=options.sectors, max_range_m=options.max_range)
+    console = Console(width=120)
+    found = {}
+    for dataset in options.datasets:
+        recording = open_dataset(dataset, max_range_m=options.max_range)
+        sectors = _sectors(recording, options, settings)
+        console.print(
+            f"{dataset}: {len(sectors)} sectors, {sum(len(s.test_points) for s in sectors)} held-out points"
+        )
+        found[dataset] = json.loads(
+            json.dumps(_curves(sectors, options.kernels, settings))
+        )  # keys as in a file
+        console.print(_table(found[dataset]))
+    for name in options.draw:
+        found |= json.loads(Path(name).read_text())
+    if options.json:
+        Path(options.json).write_text(json.dumps(found, indent=1))
+    if options.out:
+        _draw(found, options.out)
+        console.print(f"curves: {options.out}")
+    return 0
+
+
+def _options() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("datasets", nargs="*", metavar="DATASET")
+    parser.add_argument("--scans", default="0,20", help="first scans of the windows [0,20]")
+    parser.add_argument("--window", type=int, default=1, help="scans learned together [1]")
+    parser.add_argument("--sectors", type=int, default=6)
+    parser.add_argument("--max-range", type=float, default=20.0, metavar="M")
+    parser.add_argument(
+        "--kernels", default="100,200,400,800", type=lambda text: [int(k) for k in text.split(",")]
+    )
+    parser.add_argument("--json", metavar="FILE", help="write the numbers")
+    parser.add_argument(
+        "--draw", nargs="*", default=[], metavar="FILE", help="draw the numbers of these runs too"
+    )
+    parser.add_argument("-o", "--out", metavar="PNG")
+    return parser.parse_args()
+
+
+def _sectors(recording: Recording, options: argparse.Namespace, settings: LearningSettings) -> list[Sector]:
+    sectors = []
+    for first in map(int, options.scans.split(",")):
+        numbers = range(first, min(first + options.window, len(recording)))
+        parts = [HoldOut().split(recording[number], number) for number in numbers]
+        scans = [to_scan(scan, number) for (scan, _), number in zip(parts, numbers, strict=True)]
+        for cut in cut_sectors(scans, settings, np.random.default_rng(first)):
+            where = SectorOf(parts[0][0], cut.number, settings)
+            picked = [where.pick(labels) for _, labels in parts]
+            occupied = np.concatenate([p[1] for p in picked])
+            if cut.occupied.sum() >= settings.min_hits and occupied.any() and not occupied.all():
+                sectors.append(
+                    Sector(cut.points, cut.occupied, np.concatenate([p[0] for p in picked]), occupied)
+                )
+    return sectors
+
+
+def _curves(sectors: list[Sector], counts: list[int], settings: LearningSettings) -> dict:
+    curves: dict = {"grid": {}, "favoured": {}, "learned": {}, "seconds": {}}
+    for count in track([*counts, 2 * counts[-1]], description="grid", console=Console(stderr=True)):
+        both = [_grid(sector, min(count, _limit(sector)), settings) for sector in sectors]
+        curves["grid"][count] = [_plain(own) for own, _ in both]
+        curves["favoured"][count] = [_plain(best) for _, best in both]
+    for count in track(counts, description="learned", console=Console(stderr=True)):
+        rows, seconds = [], []
+        for sector in sectors:
+            started = time.perf_counter()
+            limit = min(count, _limit(sector))
+            posterior = learn_kernels(
+                sector.points,
+                sector.occupied,
+                LearningSettings(**_with(settings, max_kernels=limit, points_per_kernel=1)),
+            )
+            seconds.append(time.perf_counter() - started)
+            gamma = posterior.gamma_shape / posterior.gamma_rate
+            rows.append(_plain(_scored(sector, posterior.hinge_mean, gamma, posterior.weight_mean)))
+        curves["learned"][count], curves["seconds"][count] = rows, seconds
+    return curves
+
+
+def _limit(sector: Sector) -> int:
+    return max(1, len(sector.points) // _POINTS_PER_KERNEL)
+
+
+def _with(settings: LearningSettings, **changes: object) -> dict:
+    return {name: getattr(settings, name) for name in settings.__slots__} | changes
+
+
+def _grid(sector: Sector, count: int, settings: LearningSettings) -> tuple[Metrics, Metrics]:
+    points, occupied = sector.points, sector.occupied
+    if len(points) > settings.max_labelled:  # the learner draws the same ones
+        drawn = np.random.default_rng(0).choice(len(points), settings.max_labelled, replace=False)
+        points, occupied = points[drawn], occupied[drawn]
+    hinge, started = lattice(points, count)
+    gamma = started / _GRID_LENGTH**2
+    features = sparse_features(points, hinge, gamma, cut=1e-3)
+    results = {}
+    for prior_var in {settings.weight_var, *_FAVOURED_PRIORS}:
+        solved = fit_sparse(
+            features, occupied, np.zeros(len(hinge), np.float32), np.full(len(hinge), prior_var, np.float32),
+            sample_weight=beam_weights(occupied, settings.free_per_beam), max_newton=30, max_conjugate_gradient=200,
+        )  # fmt: skip
+        results[prior_var] = _scored(sector, hinge, gamma, solved.mean)
+    return results[settings.weight_var], min(results.values(), key=lambda metrics: metrics.nll)
+
+
+def _scored(sector: Sector, hinge: np.ndarray, gamma: np.ndarray, weight: np.ndarray) -> Metrics:
+    answer = KernelMap.from_arrays(hinge, gamma, weight, np.zeros(len(weight))).occupancy(sector.test_points)
+    return score(answer.mean, sector.test_occupied)
+
+
+def _plain(metrics: Metrics) -> dict[str, float]:
+    return {"auc": metrics.auc, "nll": metrics.nll, "ece": metrics.ece, "accuracy": metrics.accuracy}
+
+
+def _table(curves: dict) -> Table:
+    table = Table(box=None, pad_edge=False, header_style="dim")
+    for name in (
+        "kernels",
+        "grid AUC",
+        "grid NLL",
+        "grid ECE",
+        "learned AUC",
+        "learned NLL",
+        "learned ECE",
+        "s a sector",
+    ):
+        table.add_column(name, justify="right")
+    table.add_column("better than the grid: AUC", justify="right")
+    table.add_column("NLL", justify="right")
+    table.add_column("NLL, favoured", justify="right")
+    table.add_column("NLL, twice as many", justify="right")
+    for count, grid in curves["grid"].items():
+        twice = curves["grid"].get(str(2 * int(count)))
+        row = [count, *(f"{_mean(grid, key):.4f}" for key in ("auc", "nll", "ece"))]
+        if count in curves["learned"]:
+            learned = curves["learned"][count]
+            row += [f"{_mean(learned, key):.4f}" for key in ("auc", "nll", "ece")]
+            row += [f"{np.mean(curves['seconds'][count]):.1f}"]
+            row += [f"{_share(learned, grid, 'auc'):.0%}", f"{_share(learned, grid, 'nll'):.0%}"]
+            row += [f"{_share(learned, curves['favoured'][count], 'nll'):.0%}"]
+            row += ["-" if twice is None else f"{_share(learned, twice, 'nll'):.0%}"]
+        table.add_row(*row)
+    return table
+
+
+def _mean(rows: list[dict[str, float]], key: str) -> float:
+    return float(np.mean([row[key] for row in rows]))
+
+
+def _share(ours: list[dict[str, float]], theirs: list[dict[str, float]], key: str) -> float:
+    """Of sectors in which ours is at least as good."""
+    sign = 1.0 if key == "auc" else -1.0
+    return float(np.mean([sign * a[key] >= sign * b[key] for a, b in zip(ours, theirs, strict=True)]))
+
+
+def _draw(found: dict, path: str) -> None:
+    import matplotlib.pyplot as plt
+
+    figure, axes = plt.subplots(
+        2, len(found), figsize=(4.2 * len(found), 6.0), squeeze=False, layout="constrained"
+    )
+    for column, (name, curves) in enumerate(found.items()):
+        for row, (key, label) in enumerate((("nll", "NLL, nats"), ("auc", "AUC"))):
+            axis = axes[row, column]
+            for method, colour in (("grid", "0.45"), ("learned", "tab:blue")):
+                counts = [int(count) for count in curves[method]]
+                values = np.array([[r[key] for r in rows] for rows in curves[method].values()])
+                axis.plot(counts, values.mean(axis=1), "o-", color=colour, label=method)
+                axis.fill_between(
+                    counts, *np.quantile(values, (0.25, 0.75), axis=1), color=colour, alpha=0.15, lw=0
+                )
+            axis.set_xscale("log")
+            axis.set_xticks([int(count) for count in curves["grid"]], list(curves["grid"]))
+            axis.minorticks_off()
+            axis.set_ylabel(label)
+            axis.grid(alpha=0.3)
+        axes[0, column].set_title(Path(name).name if "/" in name else name)
+        axes[1, column].set_xlabel("kernels")
+    axes[0, 0].legend(frameon=False)
+    figure.savefig(path, dpi=110)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,135 @@
+"""Atoms as a client holds them: fetched from a server, made from arrays, or read from a `*.atom` file."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from potclient.errors import BadReplyError, UsageError
+from potclient.kernels import KernelSet
+from potclient.results import Float32
+from potschemas import messages
+from potschemas.messages import DType
+from potschemas.wire import WireError, decode, decode_array, encode, encode_array
+
+
+@dataclasses.dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Atom:
+    """One atom of a dictionary, whole. Frame: sensor at the origin, x along the sector's bisector."""
+
+    info: messages.AtomInfo
+    hit_points: Float32  # (H, 3) m, atom frame
+    free_points: Float32  # (F, 3) m, atom frame
+    kernels: (
+        KernelSet  # atom frame; its three scalars belong to the map that was asked, and do not travel back
+    )
+
+    @staticmethod
+    def create(
+        atom_id: str,
+        hit_points: ArrayLike,
+        free_points: ArrayLike,
+        kernels: KernelSet,
+        *,
+        dims: int,
+        radius_m: float,
+        azimuth_width_rad: float,
+        provenance: Mapping[str, str] | None = None,
+    ) -> Atom:
+        """An atom from arrays. Values are left for the server to judge.
+
+        Args:
+            atom_id: 1 to 63 of `a-z 0-9 _ . -`.
+            hit_points: (H, 3) m, atom frame: echoes.
+            free_points: (F, 3) m, atom frame: free space.
+            kernels: Learned on these points, atom frame.
+            dims: 2 (all z are 0) or 3.
+            radius_m: Of the sector, m.
+            azimuth_width_rad: Opening of the sector.
+            provenance: Source, scan, licence, learner, held-out scores: whatever tells where it comes from.
+        Raises:
+            UsageError: an argument has the wrong shape or type.
+        """
+        hits, free = _points(hit_points, "hit_points"), _points(free_points, "free_points")
+        if dims not in (2, 3):
+            raise UsageError(f"atom {atom_id}: {dims} dimensions, need 2 or 3")
+        info = messages.AtomInfo(
+            atom_id=atom_id,
+            dims=dims,
+            n_hits=len(hits),
+            n_free=len(free),
+            n_kernels=len(kernels),
+            radius_m=float(radius_m),
+            azimuth_width_rad=float(azimuth_width_rad),
+            times_used=0,
+            provenance={str(key): str(value) for key, value in (provenance or {}).items()},
+        )
+        return Atom(info=info, hit_points=hits, free_points=free, kernels=kernels)
+
+    def to_message(self) -> messages.Atom:
+        """The wire form."""
+        return messages.Atom(
+            info=self.info,
+            hit_points=encode_array(self.hit_points),
+            free_points=encode_array(self.free_points),
+            kernels=self.kernels.to_message(),
+        )
+
+    @staticmethod
+    def from_message(message: messages.Atom) -> Atom:
+        """The atom in a message.
+
+        Raises:
+            BadReplyError: an array has the wrong dtype, shape or byte count.
+        """
+        try:
+            hits, free = (
+                decode_array(getattr(message, name), name, dtypes=(DType.FLOAT32,), shape=(None, 3))
+                for name in ("hit_points", "free_points")
+            )
+        except WireError as error:
+            raise BadReplyError(f"atom {message.info.atom_id}: {error}") from error
+        return Atom(
+            info=message.info,
+            hit_points=hits.astype(np.float32),
+            free_points=free.astype(np.float32),
+            kernels=KernelSet.from_message(message.kernels),
+        )
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write a `*.atom` file, which is the message `pot.atom.v1`, whole or not at all."""
+        target = Path(path)
+        partial = target.with_name(target.name + ".partial")
+        partial.write_bytes(encode(self.to_message()))
+        partial.replace(target)
+
+    @staticmethod
+    def load(path: str | os.PathLike[str]) -> Atom:
+        """Read what `save`, or `potserver atoms export`, wrote.
+
+        Raises:
+            UsageError: not such a file.
+        """
+        try:
+            return Atom.from_message(decode(Path(path).read_bytes(), messages.Atom))
+        except OSError as error:
+            raise UsageError(f"{path}: {error.strerror or error}") from error
+        except (WireError, BadReplyError) as error:
+            raise UsageError(
+                f"{path}: not an *.atom file ({error}); `potserver atoms export` takes them out of a dictionary"
+            ) from error
+
+
+def _points(value: ArrayLike, name: str) -> Float32:
+    try:
+        points: Float32 = np.asarray(value, np.float32)
+    except (TypeError, ValueError) as error:
+        raise UsageError(f"{name}: not an array of numbers ({error})") from error
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise UsageError(f"{name}: shape {points.shape}, need (N, 3)")
+    return points

@@ -1,0 +1,253 @@
+"""The overall map as it is kept: cubes of evidence and kernels, with coordinates relative to their cube.
+
+A scan works on a `Region`, a copy of the tiles around it as one set of arrays; `Region.tiles` cuts it up again. Tiles never
+change, so a scan that fails leaves nothing behind, and what a scan costs depends on the tiles about it and not on the map.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from potserver.domain.kernel_map import IndexedKernels
+from potserver.domain.types import Bool, Float32, Float64, KernelSet
+from potserver.errors import SettingsError, ShapeError
+from potserver.numerics.evidence import Rows, is_alive
+from potserver.numerics.voxel_hash import CELL_LIMIT
+
+TileIndex = tuple[int, int, int]  # floor(p_map / tile_size_m)
+
+COARSE, FINE, CARRIED = 0, 1, 2  # where a kernel of the overall map comes from: a lattice, or an atom
+COARSE_SPACING = 2.5  # of the coarse lattice, in resolutions
+_PART = 3  # tiles along an edge of what is indexed together: an index for each tile alone would cost more to build
+_VOXELS_OF_PAIR = 5  # two coarse cells are five fine ones: the least length that every lattice divides
+
+
+@dataclasses.dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class MapKernels:
+    """K kernels of the overall map, and what is needed to fit them again.
+
+    The prior is kept apart from the weights: what a fit returned must never be the next fit's prior, or data count twice.
+
+    Raises (on construction):
+        ShapeError: the arrays disagree on K.
+    """
+
+    kernels: KernelSet  # weights as fitted last
+    level: NDArray[np.int8]  # (K,) COARSE, FINE or CARRIED
+    prior_mean: Float32  # (K,) log-odds
+    prior_var: Float32  # (K,) log-odds^2, > 0
+
+    def __post_init__(self) -> None:
+        for name in ("level", "prior_mean", "prior_var"):
+            if getattr(self, name).shape != (len(self.kernels),):
+                raise ShapeError(f"{name}: {getattr(self, name).shape}, need ({len(self.kernels)},)")
+
+    def __len__(self) -> int:
+        return len(self.kernels)
+
+    def take(self, index: NDArray[np.intp] | Bool | slice) -> MapKernels:
+        """The kernels that a numpy index picks."""
+        return MapKernels(
+            kernels=self.kernels.take(index),
+            level=self.level[index],
+            prior_mean=self.prior_mean[index],
+            prior_var=self.prior_var[index],
+        )
+
+    def moved(self, by_m: Float64) -> MapKernels:
+        """The same kernels in a frame whose origin lies at -`by_m`, (3,) m, of this one."""
+        return dataclasses.replace(self, kernels=self.kernels.moved(by_m))
+
+    @staticmethod
+    def concatenate(sets: list[MapKernels]) -> MapKernels:
+        """One set of all kernels, in order; no sets give the empty set."""
+        if not sets:
+            return MapKernels.new(KernelSet.empty(), COARSE)
+        return MapKernels(
+            kernels=KernelSet.concatenate([s.kernels for s in sets]),
+            level=np.concatenate([s.level for s in sets]),
+            prior_mean=np.concatenate([s.prior_mean for s in sets]),
+            prior_var=np.concatenate([s.prior_var for s in sets]),
+        )
+
+    @staticmethod
+    def new(kernels: KernelSet, level: int) -> MapKernels:
+        """Kernels that no data have touched yet: their weights are their prior."""
+        return MapKernels(
+            kernels=kernels,
+            level=np.full(len(kernels), level, np.int8),
+            prior_mean=kernels.weight_mean,
+            prior_var=kernels.weight_var,
+        )
+
+
+class Tile(NamedTuple):
+    """One cube of the map. Frame: the map's axes, the cube's lower corner as origin."""
+
+    rows: Rows
+    kernels: MapKernels
+
+
+class TileGrid(NamedTuple):
+    """How the map is cut: all lattices of voxels and kernels divide a tile, so none crosses an edge."""
+
+    size_m: float
+    fine_m: float  # the resolution: spacing of fine kernels, edge of a voxel of free space
+
+    @staticmethod
+    def of(size_m: float, fine_m: float) -> TileGrid:
+        """The grid whose resolution is nearest to the one wanted.
+
+        Raises:
+            SettingsError: a tile would hold more voxels along an axis than can be numbered.
+        """
+        pairs = max(1, round(size_m / (_VOXELS_OF_PAIR * fine_m)))
+        if 2 * _VOXELS_OF_PAIR * pairs > 2**14:
+            raise SettingsError(
+                f"mapping.tile_size_m is {size_m} with fine_m {fine_m}: at most {2**14} half voxels fit a tile; make it smaller"
+            )
+        return TileGrid(size_m, size_m / (_VOXELS_OF_PAIR * pairs))
+
+    @property
+    def coarse_m(self) -> float:
+        """Spacing of the coarse kernels."""
+        return COARSE_SPACING * self.fine_m
+
+    @property
+    def voxels(self) -> int:
+        """Voxels of free space along a tile's edge; of hits there are twice as many."""
+        return round(self.size_m / self.fine_m)
+
+    def index_of(self, point: Float64) -> TileIndex:
+        """The tile that a (3,) point in the map lies in."""
+        x, y, z = (int(v) for v in np.floor(point / self.size_m))
+        return x, y, z
+
+
+class TiledMap(NamedTuple):
+    """The overall map. Never changes: `with_tiles` is the next one, and shares with it what is the same."""
+
+    grid: TileGrid
+    tiles: Mapping[TileIndex, Tile]
+    parts: Mapping[TileIndex, IndexedKernels]  # kernels of some tiles together, map frame, ready to be asked
+
+    @staticmethod
+    def empty(grid: TileGrid) -> TiledMap:
+        """A map without tiles."""
+        return TiledMap(grid, {}, {})
+
+    def with_tiles(self, changed: Mapping[TileIndex, Tile], observed_activation: float) -> TiledMap:
+        """The map with some tiles exchanged, or gone if they are empty; only the parts that they lie in are indexed again."""
+        tiles = dict(self.tiles)
+        for index, tile in changed.items():
+            if len(tile.rows.occupied) or len(tile.kernels):
+                tiles[index] = tile
+            else:
+                tiles.pop(index, None)
+        parts = dict(self.parts)
+        for number in dict.fromkeys(_part_of(index) for index in changed):
+            corner = [_PART * n for n in number]
+            around = itertools.product(*(range(c, c + _PART) for c in corner))
+            found = [(x, y, z) for x, y, z in around if (x, y, z) in tiles]
+            members = [tiles[index].kernels.kernels for index in found]
+            shift = np.repeat(np.reshape(found, (-1, 3)), [len(m) for m in members], axis=0)
+            if not members:
+                parts.pop(number, None)
+                continue
+            kernels = KernelSet.concatenate(members).moved(np.asarray(shift * self.grid.size_m, np.float64))
+            parts[number] = IndexedKernels.of(kernels, observed_activation)
+        return TiledMap(self.grid, tiles, parts)
+
+
+def _part_of(index: TileIndex) -> TileIndex:
+    x, y, z = index
+    return x // _PART, y // _PART, z // _PART
+
+
+@dataclasses.dataclass(slots=True, eq=False, kw_only=True)
+class Region:
+    """A box of whole tiles as one set of arrays, for the writer to work on. Frame: the lower tile's corner as origin."""
+
+    grid: TileGrid
+    lower: TileIndex
+    upper: TileIndex  # inclusive
+    rows: Rows
+    kernels: MapKernels
+
+    @staticmethod
+    def of(tiled: TiledMap, lower_m: Float64, upper_m: Float64) -> Region:
+        """Copy the tiles that a box of the map touches.
+
+        Args:
+            tiled: The map.
+            lower_m, upper_m: (3,) m, corners of the box, map frame.
+        Raises:
+            SettingsError: the box has more voxels along an axis than can be numbered.
+        """
+        grid = tiled.grid
+        low, high = grid.index_of(lower_m), grid.index_of(upper_m)
+        if (max(b - a for a, b in zip(low, high, strict=True)) + 2) * 2 * grid.voxels >= CELL_LIMIT:
+            raise SettingsError(
+                f"a scan spans {(upper_m - lower_m).round().tolist()} m, too far for voxels of {grid.fine_m:.3g} m: lower"
+                " mapping.max_range_m or raise mapping.fine_m"
+            )
+        axes = [range(a, b + 1) for a, b in zip(low, high, strict=True)]
+        found = [(x, y, z) for x, y, z in itertools.product(*axes) if (x, y, z) in tiled.tiles]
+        members = [tiled.tiles[index] for index in found]
+        shift = np.reshape(found, (-1, 3)).astype(np.int64) - low
+        rows = Rows.concatenate([tile.rows for tile in members])
+        kernels = MapKernels.concatenate([tile.kernels for tile in members])
+        of_row = np.repeat(shift, [len(tile.rows.occupied) for tile in members], axis=0)
+        of_kernel = np.repeat(shift, [len(tile.kernels) for tile in members], axis=0)
+        edge = _tile_edge(rows, grid)
+        return Region(
+            grid=grid, lower=low, upper=high, kernels=kernels.moved(np.asarray(of_kernel * grid.size_m, np.float64)),
+            rows=rows._replace(voxel=(rows.voxel + of_row * edge).astype(np.int32)),
+        )  # fmt: skip
+
+    @property
+    def origin_m(self) -> Float64:
+        """(3,) m, map frame."""
+        return np.asarray(self.lower, np.float64) * self.grid.size_m
+
+    def tiles(self, lower_m: Float64, upper_m: Float64) -> dict[TileIndex, Tile]:
+        """The tiles that a box touches, cut out again; rows that say nothing any more are left out.
+
+        Args:
+            lower_m, upper_m: (3,) m, corners of a box in the region, map frame: outside it nothing was changed.
+        """
+        low, high = self.grid.index_of(lower_m), self.grid.index_of(upper_m)
+        rows = self.rows.take(is_alive(self.rows))
+        edge = _tile_edge(rows, self.grid)
+        row_tile = rows.voxel // edge
+        rows = rows._replace(voxel=(rows.voxel - row_tile * edge).astype(np.int32))
+        hinge = self.kernels.kernels.hinge_mean
+        # rounding may put a kernel of the outermost tiles just outside
+        size = np.asarray(self.upper, np.int64) - np.asarray(self.lower, np.int64) + 1
+        kernel_tile = np.clip(np.floor(hinge / self.grid.size_m), 0, size - 1).astype(np.int64)
+        kernels = self.kernels.moved(np.asarray(-kernel_tile * self.grid.size_m, np.float64))
+        row_members, kernel_members = _by_tile(row_tile, size), _by_tile(kernel_tile, size)
+        out = {}
+        for number, shift in enumerate(itertools.product(*(range(s) for s in size))):
+            index = (self.lower[0] + shift[0], self.lower[1] + shift[1], self.lower[2] + shift[2])
+            if all(x <= i <= y for x, i, y in zip(low, index, high, strict=True)):
+                out[index] = Tile(rows.take(row_members[number]), kernels.take(kernel_members[number]))
+        return out
+
+
+def _tile_edge(rows: Rows, grid: TileGrid) -> NDArray[np.int64]:
+    """(R, 1) voxels along a tile's edge, for each row in its own kind of voxel."""
+    return np.where(rows.occupied, 2 * grid.voxels, grid.voxels)[:, None]
+
+
+def _by_tile(tile: NDArray[np.integer], size: NDArray[np.int64]) -> list[NDArray[np.intp]]:
+    """For each tile of the box, the numbers of what lies in it, ascending."""
+    number = (tile[:, 0] * size[1] + tile[:, 1]) * size[2] + tile[:, 2]
+    counts = np.bincount(number, minlength=int(size.prod()))
+    return np.split(np.argsort(number, kind="stable"), np.cumsum(counts)[:-1])

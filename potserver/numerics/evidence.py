@@ -1,0 +1,331 @@
+"""Evidence: all labelled points ever seen, as one weighted pseudo-datum a voxel and label.
+
+A row holds the weight of the samples that fell into its voxel, and their weighted sum of positions, relative to the voxel's
+centre. So it stands at their mean, rows of two maps add, and what was added can be taken off again. Hits are kept in voxels of
+half the resolution, free samples in voxels of the resolution; there are never more rows than voxels, whatever is seen.
+
+All functions are pure but for `forget`, `fade` and `decay`, which scale sums in place.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numba as nb
+import numpy as np
+from numpy.typing import NDArray
+
+from potserver.numerics.threads import parallel_map, spans
+from potserver.numerics.voxel_hash import empty_table, enter, find, pack
+
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+Int32 = NDArray[np.int32]
+Int64 = NDArray[np.int64]
+Bool = NDArray[np.bool_]
+
+_LEAST_WEIGHT = 1e-3  # a row with less says nothing
+_MAX_PASSES = 5.0  # that one scan may hold against a row
+_WALK = 0.75  # step of a walk along a beam, in voxels of hits
+_SPANS = 8  # of beams; fixed, like all spans of work, though these only count
+
+
+class Rows(NamedTuple):
+    """R pseudo-data in one frame."""
+
+    voxel: Int32  # (R, 3) cell numbers from the frame's origin, in cells of the resolution (free) or half of it (hits)
+    occupied: Bool  # (R,)
+    sums: Float32  # (R, 4) sum of w (x - centre) for each axis, m; sum of w
+
+    @staticmethod
+    def empty() -> Rows:
+        """No rows."""
+        return Rows(np.zeros((0, 3), np.int32), np.zeros(0, bool), np.zeros((0, 4), np.float32))
+
+    @staticmethod
+    def concatenate(sets: list[Rows]) -> Rows:
+        """All rows, in order."""
+        return Rows(*(np.concatenate(parts) for parts in zip(*sets, strict=True))) if sets else Rows.empty()
+
+    def take(self, index: NDArray[np.intp] | Bool | slice) -> Rows:
+        """The rows that a numpy index picks."""
+        return Rows(self.voxel[index], self.occupied[index], self.sums[index])
+
+
+class Added(NamedTuple):
+    """Rows after samples were added."""
+
+    rows: Rows  # the old ones first, in their order
+    weight: Float32  # (R,) what each row gained
+
+
+def add(rows: Rows, points: Float64, occupied: Bool, weight: Float64 | Float32, fine_m: float) -> Added:
+    """Add weighted samples to the rows; a negative weight takes samples off, down to nothing and no further.
+
+    Args:
+        rows: Each voxel and label once.
+        points: (N, 3) m, in the rows' frame.
+        occupied: (N,) labels.
+        weight: (N,) of each sample.
+        fine_m: The resolution.
+    """
+    n_old, n = len(rows.occupied), len(points)
+    voxel = np.empty((n_old + n, 3), np.int32)
+    label = np.empty(n_old + n, bool)
+    sums = np.zeros((n_old + n, 4), np.float32)
+    voxel[:n_old], label[:n_old], sums[:n_old] = rows
+    gained = np.zeros(n_old + n, np.float32)
+    used = _add(
+        voxel, label, sums, gained, n_old, np.ascontiguousarray(points), occupied, np.asarray(weight, np.float64),
+        fine_m, empty_table(n_old + n),
+    )  # fmt: skip
+    return Added(Rows(voxel[:used], label[:used], sums[:used]), gained[:used])
+
+
+def positions(rows: Rows, fine_m: float) -> Float64:
+    """(R, 3) m: where the rows stand, the weighted means of their samples."""
+    edge = np.where(rows.occupied, 0.5 * fine_m, fine_m)[:, None]
+    weight = np.maximum(rows.sums[:, 3:], np.float32(1e-9))
+    return np.asarray((rows.voxel + 0.5) * edge + rows.sums[:, :3] / weight, np.float64)
+
+
+def is_alive(rows: Rows) -> Bool:
+    """(R,) which rows still say something."""
+    return rows.sums[:, 3] > _LEAST_WEIGHT
+
+
+class Cells(NamedTuple):
+    """The cell, a free voxel with the hits in it, of each row: the unit in which evidence saturates and is forgotten."""
+
+    number: Int64  # (R,) from 0
+    n: int
+
+
+def cells(rows: Rows) -> Cells:
+    """Number the cells that have rows."""
+    number, n = _cells(rows.voxel, rows.occupied, empty_table(len(rows.occupied)))
+    return Cells(number, n)
+
+
+def forget(sums: Float32, gained: Float32, cells: Cells, limit: float) -> None:
+    """Let old evidence give way to new, in place: no cell keeps more than `limit` of weight.
+
+    Args:
+        sums: (R, 4) of the rows, what was gained included.
+        gained: (R,) the part of the weights that is new.
+        cells: Of the rows.
+        limit: Weight; of new evidence alone as much is kept as fits, in proportion.
+    """
+    _forget(sums, gained, cells.number, cells.n, limit)
+
+
+def counts(sums: Float32, cells: Cells, saturation: float) -> Float32:
+    """(R,) what each row counts in a fit: its weight / (1 + weight of its cell / saturation).
+
+    Looks at one place repeat each other, so a cell counts for at most `saturation` looks, shared among its rows by weight.
+    """
+    weight = np.maximum(sums[:, 3], np.float32(0))
+    total = np.bincount(cells.number, weight, cells.n)
+    return (weight / (1.0 + total[cells.number] / saturation)).astype(np.float32)
+
+
+def fade(
+    rows: Rows,
+    ends: Float64,
+    is_return: Bool,
+    origin: Float64,
+    *,
+    fine_m: float,
+    rate: float,
+    gap_m: float,
+    every: int = 1,
+    threads: int = 1,
+) -> int:
+    """Weaken hits that beams have passed through, in place: what stood there has left.
+
+    A beam passes a row if it goes by within a quarter of the resolution and ends well behind it. Rows with a hit of this scan
+    in their own or a touching voxel are kept: along a slanted surface beams pass many places that others hit. A row that p
+    beams passed is scaled by exp(-rate min(p, 5)).
+
+    Args:
+        rows: The sums of hit rows are changed.
+        ends: (B, 3) m, ends of the beams in the rows' frame.
+        is_return: (B,) whether they are hits.
+        origin: (3,) m, start of the beams in the rows' frame.
+        fine_m: The resolution.
+        rate: Of the decay, for each beam.
+        gap_m: A beam says nothing about this much before its hit.
+        every: Of so many beams one is followed, and stands for all of them.
+        threads: Threads to spread the beams over.
+    Returns:
+        Number of rows that were weakened.
+    """
+    hits = np.flatnonzero(rows.occupied)
+    if len(hits) == 0 or len(ends) == 0:
+        return 0
+    table = empty_table(len(hits))
+    keys = _enter_voxels(rows.voxel[hits], table)
+    where = positions(rows.take(hits), fine_m).astype(np.float32)
+    where[~is_alive(rows)[hits]] = np.inf  # nothing passes near a dead row
+
+    followed, returned = ends[::every], is_return[::every]
+
+    def run(span: tuple[int, int]) -> Int32:
+        a, b = span
+        return _passes(followed[a:b], returned[a:b], origin, table, keys, where, fine_m, gap_m)
+
+    passes = np.sum(parallel_map(run, spans(len(followed), _SPANS), threads), axis=0)
+    passed = np.flatnonzero(passes)
+    new = np.floor(ends[is_return] / (0.5 * fine_m)).astype(np.int32)
+    passed = passed[_is_lonely(rows.voxel[hits[passed]], new, empty_table(len(new)))]
+    rows.sums[hits[passed]] *= np.exp(-rate * np.minimum(passes[passed] * every, _MAX_PASSES))[
+        :, None
+    ].astype(np.float32)
+    return len(passed)
+
+
+def decay(rows: Rows, factor: float) -> Rows:
+    """All evidence scaled, say by age."""
+    return rows._replace(sums=rows.sums * np.float32(factor))
+
+
+@nb.njit(nogil=True, error_model="numpy", cache=True)
+def _add(voxel, label, sums, gained, n, points, occupied, weight, fine_m, table):
+    keys = np.empty(len(label), np.int64)
+    for r in range(n):
+        keys[r] = pack(label[r], voxel[r, 0], voxel[r, 1], voxel[r, 2])
+    enter(table, keys, n)
+    cell = np.empty(3, np.int64)
+    for i in range(len(points)):
+        edge = 0.5 * fine_m if occupied[i] else fine_m
+        for c in range(3):
+            cell[c] = np.int64(np.floor(points[i, c] / edge))
+        key = pack(occupied[i], cell[0], cell[1], cell[2])
+        place = find(table, keys, key)
+        r = table[place]
+        if r < 0:
+            if weight[i] <= 0.0:
+                continue  # nothing to take off
+            r = n
+            table[place] = r
+            keys[r] = key
+            label[r] = occupied[i]
+            for c in range(3):
+                voxel[r, c] = cell[c]
+            n += 1
+        w = weight[i]
+        if w < 0.0 and sums[r, 3] + w <= _LEAST_WEIGHT:
+            gained[r] -= sums[r, 3]
+            sums[r, :] = 0.0
+            continue
+        for c in range(3):
+            sums[r, c] += w * (points[i, c] - (cell[c] + 0.5) * edge)
+        sums[r, 3] += w
+        gained[r] += w
+    return n
+
+
+@nb.njit(nogil=True, error_model="numpy", cache=True)
+def _cells(voxel, occupied, table):
+    n_rows = len(occupied)
+    number = np.empty(n_rows, np.int64)
+    keys = np.empty(n_rows, np.int64)
+    n = 0
+    for r in range(n_rows):
+        shift = 1 if occupied[r] else 0
+        key = pack(0, voxel[r, 0] >> shift, voxel[r, 1] >> shift, voxel[r, 2] >> shift)
+        place = find(table, keys, key)
+        if table[place] < 0:
+            table[place] = n
+            keys[n] = key
+            n += 1
+        number[r] = table[place]
+    return number, n
+
+
+@nb.njit(nogil=True, error_model="numpy", cache=True)
+def _forget(sums, gained, cell, n_cells, limit):
+    total = np.zeros(n_cells)
+    new = np.zeros(n_cells)
+    for r in range(len(cell)):
+        total[cell[r]] += sums[r, 3]
+        new[cell[r]] += max(gained[r], 0.0)
+    for r in range(len(cell)):
+        t, g = total[cell[r]], new[cell[r]]
+        if g <= 0.0 or t <= limit or sums[r, 3] <= 0.0:
+            continue
+        keep_new = min(1.0, limit / g)
+        keep_old = max(limit - g, 0.0) / (t - g) if t - g > 1e-9 else 0.0
+        gain = max(gained[r], 0.0)
+        # old and new share one mean
+        sums[r] *= ((sums[r, 3] - gain) * keep_old + gain * keep_new) / sums[r, 3]
+
+
+@nb.njit(nogil=True, error_model="numpy", cache=True)
+def _enter_voxels(voxel, table):
+    keys = np.empty(len(voxel), np.int64)
+    for i in range(len(voxel)):
+        keys[i] = pack(1, voxel[i, 0], voxel[i, 1], voxel[i, 2])
+        table[find(table, keys, keys[i])] = i
+    return keys
+
+
+@nb.njit(nogil=True, error_model="numpy", cache=True)
+def _passes(ends, is_return, origin, table, keys, where, fine_m, gap_m):
+    """(R,) how many of the beams pass each row, each beam counted once."""
+    n = np.zeros(len(keys), np.int32)
+    stamp = np.full(len(keys), -1, np.int32)
+    edge = 0.5 * fine_m
+    for b in range(len(ends)):
+        dx, dy, dz = ends[b, 0] - origin[0], ends[b, 1] - origin[1], ends[b, 2] - origin[2]
+        length = np.sqrt(dx * dx + dy * dy + dz * dz)
+        if length <= 0.0:
+            continue
+        dx /= length
+        dy /= length
+        dz /= length
+        stop = length - gap_m if is_return[b] else length
+        behind = length - 2.5 * fine_m
+        s = 0.5 * _WALK * edge
+        last = np.int64(-1)
+        while s < stop:
+            key = pack(
+                1,
+                np.int64(np.floor((origin[0] + dx * s) / edge)),
+                np.int64(np.floor((origin[1] + dy * s) / edge)),
+                np.int64(np.floor((origin[2] + dz * s) / edge)),
+            )
+            s += _WALK * edge
+            if key == last:
+                continue
+            last = key
+            r = table[find(table, keys, key)]
+            if r < 0 or stamp[r] == b:
+                continue
+            px, py, pz = where[r, 0] - origin[0], where[r, 1] - origin[1], where[r, 2] - origin[2]
+            along = px * dx + py * dy + pz * dz
+            off2 = px * px + py * py + pz * pz - along * along
+            if along < behind and off2 < 0.0625 * fine_m * fine_m:
+                n[r] += 1
+                stamp[r] = b
+    return n
+
+
+@nb.njit(nogil=True, error_model="numpy", cache=True)
+def _is_lonely(voxel, new, table):
+    """(V,) which voxels have no new voxel at or beside them."""
+    keys = np.empty(len(new), np.int64)
+    for i in range(len(new)):
+        keys[i] = pack(1, new[i, 0], new[i, 1], new[i, 2])
+        place = find(table, keys, keys[i])
+        if table[place] < 0:
+            table[place] = i
+    lonely = np.ones(len(voxel), np.bool_)
+    for i in range(len(voxel)):
+        for dx in range(-1, 2):
+            for dy in range(-1, 2):
+                for dz in range(-1, 2):
+                    key = pack(1, voxel[i, 0] + dx, voxel[i, 1] + dy, voxel[i, 2] + dz)
+                    if table[find(table, keys, key)] >= 0:
+                        lonely[i] = False
+    return lonely

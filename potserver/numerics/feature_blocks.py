@@ -1,0 +1,289 @@
+"""Dense blocks of features: rows are sorted into cubes, and each cube has phi of all its rows and all kernels that reach it.
+
+Against sparse rows a block has one list of kernels for all its rows, so products gather and scatter once a cube and run over
+dense memory; about half of what they touch is smaller than the cut, and still they are several times faster. Blocks are built
+anew for every solve: that costs less than keeping them right while rows move and kernels come.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numba as nb
+import numpy as np
+from numpy.typing import NDArray
+
+from potserver.numerics.cubes import sort_into_cubes
+from potserver.numerics.fastexp import FAST, exp32
+from potserver.numerics.kernel_index import _box, _gather, build_index
+from potserver.numerics.threads import parallel_map, spans
+
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+Int32 = NDArray[np.int32]
+Int64 = NDArray[np.int64]
+Floats = NDArray[np.floating]
+
+_SPANS = 8  # of cubes; fixed, because sums over spans must not depend on the number of threads
+
+
+class Block(NamedTuple):
+    """Some cubes: phi of cube c is (cuts[c + 1] - cuts[c], kernels[c + 1] - kernels[c]), row by row, from values[c] on."""
+
+    cuts: Int64  # (C + 1,) first row of each cube, in the sorted order
+    kernels: Int64  # (C + 1,) where each cube's kernels start in `numbers`
+    starts: Int64  # (C + 1,) where each cube's phi starts in `phi`
+    numbers: Int32
+    phi: Float32
+
+
+class Blocks(NamedTuple):
+    """Phi of N rows and K kernels."""
+
+    order: Int64  # (N,) row r of the blocks is points[order[r]]
+    parts: list[Block]  # runs of cubes, always cut alike
+    n_kernels: int
+
+    @property
+    def n_values(self) -> int:
+        """Stored values of phi: one product with the features touches each once."""
+        return sum(len(part.phi) for part in self.parts)
+
+
+def feature_blocks(
+    points: Float64, hinge: Float64, gamma: Floats, *, edge_m: float, cut: float, threads: int = 1
+) -> Blocks:
+    """phi of the kernels that reach each cube of points.
+
+    Args:
+        points: (N, 3) m, small coordinates (they are made relative to their cube in float32).
+        hinge: (K, 3) m, same frame.
+        gamma: (K,) 1/m^2.
+        edge_m: Of a cube; some twenty points to a cube are good.
+        cut: A kernel reaches as far as its phi is at least this.
+        threads: Threads to spread the cubes over.
+    """
+    if len(points) == 0 or len(hinge) == 0:
+        return Blocks(np.arange(len(points)), [], len(hinge))
+    ones = np.ones(len(hinge))
+    index = build_index(
+        hinge, gamma, ones, np.zeros(len(hinge)), activation_cut=cut, tau=cut, guard_stacks=False
+    )
+    order, cuts, groups = sort_into_cubes(points, edge_m)
+    grouped = points[order]
+
+    def run(span: tuple[int, int]) -> Block:
+        # whole groups: kernels are looked up once for each, and then picked for its cubes
+        inside = cuts[groups[span[0]] : groups[span[1]] + 1]
+        return Block(
+            inside,
+            *_build(
+                grouped, inside, groups[span[0] : span[1] + 1] - groups[span[0]], index.hinge, index.columns,
+                index.order, index.level_start, index.level_edge, index.level_cell, index.level_size, index.keys,
+            ),
+        )  # fmt: skip
+
+    return Blocks(order, parallel_map(run, spans(len(groups) - 1, _SPANS), threads), len(hinge))
+
+
+def product(blocks: Blocks, weights: Float32, *, threads: int = 1) -> Float32:
+    """(N,) Phi w, in the blocks' order."""
+    out = np.zeros(len(blocks.order), np.float32)
+    parallel_map(
+        lambda b: _product(b.cuts, b.kernels, b.starts, b.numbers, b.phi, weights, out), blocks.parts, threads
+    )
+    return out
+
+
+def gradient_and_diagonal(
+    blocks: Blocks, residual: Float32, curvature: Float32, *, threads: int = 1
+) -> tuple[Float32, Float32]:
+    """(K,) Phi^T r and (K,) diagonal of Phi^T diag(curvature) Phi, in one pass."""
+    parts = parallel_map(
+        lambda b: _gradient(
+            b.cuts, b.kernels, b.starts, b.numbers, b.phi, residual, curvature, blocks.n_kernels
+        ),
+        blocks.parts,
+        threads,
+    )
+    total = np.zeros((2, blocks.n_kernels), np.float32)
+    for part in parts:
+        total += part
+    return total[0], total[1]
+
+
+def normal_product(blocks: Blocks, curvature: Float32, direction: Float32, *, threads: int = 1) -> Float32:
+    """(K,) Phi^T diag(curvature) Phi d, in one pass."""
+    parts = parallel_map(
+        lambda b: _normal(b.cuts, b.kernels, b.starts, b.numbers, b.phi, curvature, direction),
+        blocks.parts,
+        threads,
+    )
+    return np.sum(parts, axis=0, dtype=np.float32) if parts else np.zeros(blocks.n_kernels, np.float32)
+
+
+# The inner loops get their row as a slice: with an offset into the whole array the compiler must expect negative indices, and
+# makes no SIMD code.
+@nb.njit(nogil=True, fastmath=FAST, error_model="numpy", cache=True)
+def _phi_row(x, y, z, hx, hy, hz, minus_gamma, out):
+    for i in range(len(out)):
+        dx = x - hx[i]
+        dy = y - hy[i]
+        dz = z - hz[i]
+        out[i] = exp32(minus_gamma[i] * (dx * dx + dy * dy + dz * dz))
+
+
+@nb.njit(nogil=True, error_model="numpy", cache=True)
+def _build(
+    points, cuts, groups, hinge, columns, order, level_start, level_edge, level_cell, level_size, keys
+):
+    n_cubes = len(cuts) - 1
+    kernels = np.zeros(n_cubes + 1, np.int64)
+    starts = np.zeros(n_cubes + 1, np.int64)
+    reached = np.empty(64 * n_cubes + 4096, np.int64)
+    found = np.empty(4096, np.int64)
+    centre = np.empty((n_cubes, 3))
+    lower = np.empty(3)
+    upper = np.empty(3)
+    near = np.empty((4, 4096), np.float32)
+    widest = 0
+    for g in range(len(groups) - 1):
+        _box(points, cuts[groups[g]], cuts[groups[g + 1]], lower, upper)
+        n_near, found = _gather(
+            lower, upper, hinge, columns, level_start, level_edge, level_cell, level_size, keys, found
+        )
+        if n_near > near.shape[1]:
+            near = np.empty((4, 2 * n_near), np.float32)
+        gx, gy, gz = lower
+        for i in range(n_near):
+            m = found[i]
+            near[0, i] = hinge[m, 0] - gx
+            near[1, i] = hinge[m, 1] - gy
+            near[2, i] = hinge[m, 2] - gz
+            near[3, i] = columns[3, m] * columns[3, m]
+        for cube in range(groups[g], groups[g + 1]):
+            a, b = cuts[cube], cuts[cube + 1]
+            _box(points, a, b, lower, upper)
+            first = kernels[cube]
+            if first + n_near > len(reached):
+                more = np.empty(2 * (first + n_near), np.int64)
+                more[:first] = reached[:first]
+                reached = more
+            x0, y0, z0 = np.float32(lower[0] - gx), np.float32(lower[1] - gy), np.float32(lower[2] - gz)
+            x1, y1, z1 = np.float32(upper[0] - gx), np.float32(upper[1] - gy), np.float32(upper[2] - gz)
+            n = 0
+            for i in range(n_near):
+                dx = max(max(x0 - near[0, i], near[0, i] - x1), np.float32(0))
+                dy = max(max(y0 - near[1, i], near[1, i] - y1), np.float32(0))
+                dz = max(max(z0 - near[2, i], near[2, i] - z1), np.float32(0))
+                if dx * dx + dy * dy + dz * dz <= near[3, i]:
+                    reached[first + n] = found[i]
+                    n += 1
+            for c in range(3):
+                centre[cube, c] = 0.5 * (lower[c] + upper[c])
+            widest = max(widest, n)
+            kernels[cube + 1] = first + n
+            starts[cube + 1] = starts[cube] + (b - a) * n
+    numbers = np.empty(kernels[-1], np.int32)
+    phi = np.empty(starts[-1], np.float32)  # of the right size at once: it is large
+    local = np.empty((4, widest), np.float32)
+    for cube in range(n_cubes):
+        first, at = kernels[cube], starts[cube]
+        n = kernels[cube + 1] - first
+        cx, cy, cz = centre[cube]
+        for i in range(n):
+            m = reached[first + i]
+            local[0, i] = hinge[m, 0] - cx
+            local[1, i] = hinge[m, 1] - cy
+            local[2, i] = hinge[m, 2] - cz
+            local[3, i] = columns[0, m]
+            numbers[first + i] = order[m]
+        for q in range(cuts[cube], cuts[cube + 1]):
+            _phi_row(
+                np.float32(points[q, 0] - cx), np.float32(points[q, 1] - cy), np.float32(points[q, 2] - cz),
+                local[0], local[1], local[2], local[3], phi[at : at + n],
+            )  # fmt: skip
+            at += n
+    return kernels, starts, numbers, phi
+
+
+@nb.njit(nogil=True, fastmath=FAST, error_model="numpy", cache=True)
+def _dot(row, w):
+    s = np.float32(0)
+    for i in range(len(row)):
+        s += row[i] * w[i]
+    return s
+
+
+@nb.njit(nogil=True, fastmath=FAST, error_model="numpy", cache=True)
+def _axpy(row, a, out):
+    for i in range(len(row)):
+        out[i] += a * row[i]
+
+
+@nb.njit(nogil=True, fastmath=FAST, error_model="numpy", cache=True)
+def _axpy_both(row, a, b, out, squares):
+    for i in range(len(row)):
+        out[i] += a * row[i]
+        squares[i] += b * row[i] * row[i]
+
+
+@nb.njit(nogil=True, error_model="numpy", cache=True)
+def _widest(kernels):
+    widest = 0
+    for c in range(len(kernels) - 1):
+        widest = max(widest, kernels[c + 1] - kernels[c])
+    return widest
+
+
+@nb.njit(nogil=True, error_model="numpy", cache=True)
+def _product(cuts, kernels, starts, numbers, phi, weights, out):
+    w = np.empty(_widest(kernels), np.float32)
+    for c in range(len(cuts) - 1):
+        first, at = kernels[c], starts[c]
+        n = kernels[c + 1] - first
+        for i in range(n):
+            w[i] = weights[numbers[first + i]]
+        for q in range(cuts[c], cuts[c + 1]):
+            out[q] = _dot(phi[at : at + n], w)
+            at += n
+
+
+@nb.njit(nogil=True, error_model="numpy", cache=True)
+def _gradient(cuts, kernels, starts, numbers, phi, residual, curvature, n_kernels):
+    out = np.zeros((2, n_kernels), np.float32)
+    widest = _widest(kernels)
+    sums, squares = np.empty(widest, np.float32), np.empty(widest, np.float32)
+    for c in range(len(cuts) - 1):
+        first, at = kernels[c], starts[c]
+        n = kernels[c + 1] - first
+        sums[:n] = 0
+        squares[:n] = 0
+        for q in range(cuts[c], cuts[c + 1]):
+            _axpy_both(phi[at : at + n], residual[q], curvature[q], sums, squares)
+            at += n
+        for i in range(n):
+            m = numbers[first + i]
+            out[0, m] += sums[i]
+            out[1, m] += squares[i]
+    return out
+
+
+@nb.njit(nogil=True, error_model="numpy", cache=True)
+def _normal(cuts, kernels, starts, numbers, phi, curvature, direction):
+    out = np.zeros(len(direction), np.float32)
+    widest = _widest(kernels)
+    d, sums = np.empty(widest, np.float32), np.empty(widest, np.float32)
+    for c in range(len(cuts) - 1):
+        first, at = kernels[c], starts[c]
+        n = kernels[c + 1] - first
+        sums[:n] = 0
+        for i in range(n):
+            d[i] = direction[numbers[first + i]]
+        for q in range(cuts[c], cuts[c + 1]):
+            row = phi[at : at + n]
+            _axpy(row, _dot(row, d) * curvature[q], sums)
+            at += n
+        for i in range(n):
+            out[numbers[first + i]] += sums[i]
+    return out

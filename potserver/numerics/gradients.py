@@ -1,0 +1,134 @@
+"""Gradients of the latent's sums, and of the occupancy probability that follows from them. All analytic."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numba as nb
+import numpy as np
+from numpy.typing import NDArray
+
+from potserver.numerics.fastexp import FAST, exp32
+from potserver.numerics.kernel_index import Float32, Float64, KernelIndex, _box, _gather, group_points
+from potserver.numerics.occupancy import Float, predict_occupancy
+from potserver.numerics.threads import parallel_map, spans
+
+
+class LatentGradients(NamedTuple):
+    """Gradients of the sums of `kernel_index.LatentSums` at N points, each (N, 3), per metre."""
+
+    mean: Float32
+    var: Float32
+    activation: Float32
+
+
+def latent_gradients(
+    index: KernelIndex, points: Float64, *, threads: int = 1, lane: str = "map"
+) -> LatentGradients:
+    """d/dx of sum w phi, sum v phi^2 and sum phi, with d phi/dx = -2 gamma (x - h) phi.
+
+    Args:
+        points: (N, 3) float64, m, same frame as the hinges.
+        threads, lane: See `kernel_index.latent_sums`.
+    """
+    n = len(points)
+    out = np.zeros((9, n), np.float32)
+    if n and len(index.hinge):
+        order, cuts = group_points(points, index.median_reach_m)
+        grouped = points[order]
+        sums = np.zeros((9, n), np.float32)
+
+        def run(span: tuple[int, int]) -> None:
+            _gradient_cubes(
+                grouped, cuts[span[0] : span[1] + 1], index.hinge, index.columns, index.level_start, index.level_edge,
+                index.level_cell, index.level_size, index.keys, sums,
+            )  # fmt: skip
+
+        parallel_map(run, spans(len(cuts) - 1, 16 * threads if threads > 1 else 1), threads, lane)
+        out[:, order] = sums
+    return LatentGradients(*(np.ascontiguousarray(out[i : i + 3].T) for i in (0, 3, 6)))
+
+
+def occupancy_gradient(
+    latent_mean: Float,
+    latent_var: Float,
+    mean_gradient: Float,
+    var_gradient: Float,
+    mean_moderation: float = 1.0,
+) -> NDArray[np.float64]:
+    """(N, 3) gradient of sigmoid(mu / sqrt(1 + c pi s2 / 8)), per metre, from those of mu and s2.
+
+    Args:
+        latent_mean, latent_var: (N,) mu, log-odds, and s2, log-odds^2.
+        mean_gradient, var_gradient: (N, 3) theirs, per metre.
+        mean_moderation: c, see `predict_occupancy`.
+    """
+    mu, s2 = np.asarray(latent_mean, np.float64), np.asarray(latent_var, np.float64)
+    c = mean_moderation * math.pi
+    scale = 1.0 / np.sqrt(1.0 + (c / 8.0) * s2)
+    p = predict_occupancy(mu, s2, mean_moderation).mean
+    z_gradient = scale[:, None] * mean_gradient - (c / 16.0) * (mu * scale**3)[:, None] * var_gradient
+    return np.asarray((p * (1.0 - p))[:, None] * z_gradient, np.float64)
+
+
+@nb.njit(nogil=True, fastmath=FAST, error_model="numpy", cache=True)
+def _gradient_point(x, y, z, hx, hy, hz, minus_gamma, w, v, n):
+    mx = my = mz = np.float32(0)
+    vx = vy = vz = np.float32(0)
+    ax = ay = az = np.float32(0)
+    two = np.float32(2)
+    for m in range(n):
+        dx = x - hx[m]
+        dy = y - hy[m]
+        dz = z - hz[m]
+        phi = exp32(minus_gamma[m] * (dx * dx + dy * dy + dz * dz))
+        slope = two * minus_gamma[m] * phi
+        a = w[m] * slope
+        b = two * v[m] * slope * phi
+        mx += a * dx
+        my += a * dy
+        mz += a * dz
+        vx += b * dx
+        vy += b * dy
+        vz += b * dz
+        ax += slope * dx
+        ay += slope * dy
+        az += slope * dz
+    return mx, my, mz, vx, vy, vz, ax, ay, az
+
+
+@nb.njit(nogil=True, error_model="numpy", cache=True)
+def _gradient_cubes(
+    points, cuts, hinge, columns, level_start, level_edge, level_cell, level_size, keys, sums
+):
+    found = np.empty(4096, np.int64)
+    local = np.empty((6, 4096), np.float32)
+    lower = np.empty(3)
+    upper = np.empty(3)
+    for cube in range(len(cuts) - 1):
+        a, b = cuts[cube], cuts[cube + 1]
+        _box(points, a, b, lower, upper)
+        n, found = _gather(
+            lower, upper, hinge, columns, level_start, level_edge, level_cell, level_size, keys, found
+        )
+        if n > local.shape[1]:
+            local = np.empty((6, 2 * n), np.float32)
+        cx = 0.5 * (lower[0] + upper[0])
+        cy = 0.5 * (lower[1] + upper[1])
+        cz = 0.5 * (lower[2] + upper[2])
+        for i in range(n):
+            m = found[i]
+            local[0, i] = hinge[m, 0] - cx
+            local[1, i] = hinge[m, 1] - cy
+            local[2, i] = hinge[m, 2] - cz
+            local[3, i] = columns[0, m]
+            local[4, i] = columns[1, m]
+            local[5, i] = columns[2, m]
+        for q in range(a, b):
+            sums[0, q], sums[1, q], sums[2, q], sums[3, q], sums[4, q], sums[5, q], sums[6, q], sums[7, q], sums[
+                8, q
+            ] = _gradient_point(
+                np.float32(points[q, 0] - cx), np.float32(points[q, 1] - cy), np.float32(points[q, 2] - cz),
+                local[0], local[1], local[2], local[3], local[4], local[5], n,
+            )  # fmt: skip

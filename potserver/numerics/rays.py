@@ -1,0 +1,252 @@
+"""Where rays through a kernel map end: occupancy as a hazard rate along each ray.
+
+    hazard(r) = -ln(1 - p(r)) / width(r)      P(nothing met before r) = exp(-integral of the hazard from 0 to r)
+
+p is the predictive mean of the occupancy at the ray's point r, and the width, in metres, is the length over which p counts as
+one trial: a stretch of that length with constant p stops the ray with probability p, in however many steps it is summed. So the
+answer has a limit as the step goes to zero, where independent trials a step would stop every ray at once. Unless a width is
+given, a point takes that of the kernels there: the mean of sqrt(pi / (2 gamma)), the integral of a squared kernel along a line
+through its hinge, weighted by activation. Values of the latent that the same kernel made are then one trial and not many; among
+multiples of 1 / sqrt(gamma) this one gave the least biased median ranges in made-up towns. With p = sigmoid(z), -ln(1 - p) is
+softplus(z), which loses nothing near 0 and 1.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numba as nb
+import numpy as np
+
+from potserver.numerics.fastexp import FAST, exp32
+from potserver.numerics.kernel_index import Float64, Int64, KernelIndex, _gather
+from potserver.numerics.threads import parallel_map, spans
+
+_END_OF_RAY = (
+    1e-7  # survival below which a ray has ended: no moment or probability changes by more than this share
+)
+_BLOCK_REACHES = (
+    3.0  # so many reaches of a kernel make the stretch for which kernels are gathered together: measured
+)
+_BLOCK_STEPS = (4, 128)  # the same in steps, least and most
+_WIDTH_OF_NOTHING_M = 1.0  # of unobserved space, in a map without kernels
+
+
+class FirstReturns(NamedTuple):
+    """The distribution of min(first return, maximum range) of N rays."""
+
+    hit_probability: Float64  # (N,) of a return before the maximum range
+    mean_m: Float64  # (N,)
+    std_m: Float64  # (N,)
+    quantile_m: Float64  # (N, Q)
+    unknown_range_m: Float64  # (N,) where the ray first enters unobserved space; NaN: nowhere before it ends
+    unknown_share: Float64  # (N,) of the ray's expected length, in unobserved space
+
+
+def kernel_widths(index: KernelIndex) -> Float64:
+    """(K,) m, in the index's order: sqrt(pi / (2 gamma)), the integral of a squared kernel along a line through its hinge."""
+    return np.sqrt(0.5 * math.pi / -index.columns[0].astype(np.float64))
+
+
+def typical_width(index: KernelIndex) -> float:
+    """The median width of the kernels, m: what counts as one trial where there are none."""
+    return float(np.median(kernel_widths(index))) if len(index.hinge) else _WIDTH_OF_NOTHING_M
+
+
+def fine_step(index: KernelIndex) -> float:
+    """A step, m, that resolves nearly all kernels: a third of the width that one kernel in twenty falls below."""
+    return (1.0 / 3.0) * float(np.quantile(kernel_widths(index), 0.05)) if len(index.hinge) else 1.0
+
+
+def count_steps(max_range_m: Float64, step_m: float) -> Int64:
+    """(N,) equal steps of at most `step_m` in which each ray is summed."""
+    return np.maximum(np.ceil(max_range_m / step_m - 1e-9), 1.0).astype(np.int64)
+
+
+def first_returns(
+    index: KernelIndex,
+    origins: Float64,
+    directions: Float64,
+    max_range_m: Float64,
+    *,
+    step_m: float,
+    quantiles: Float64,
+    unknown_rate: float,
+    width_m: float | None,
+    observed_activation: float,
+    residual_var: float,
+    mean_moderation: float = 1.0,
+    threads: int = 1,
+) -> FirstReturns:
+    """March rays by the midpoint rule, whose error falls with the square of the step.
+
+    Only kernels whose reach (see `kernel_index`) meets a stretch of the ray are summed there; often that is none.
+
+    Args:
+        origins: (N, 3) m, same frame as the hinges.
+        directions: (N, 3) of unit length.
+        max_range_m: (N,) m, > 0.
+        step_m: Longest step.
+        quantiles: (Q,) ascending, in (0, 1).
+        unknown_rate: Hazard of unobserved space, 1/m; infinite = it stops a ray at once.
+        width_m: What counts as one trial, m; None = the kernels' own.
+        observed_activation, residual_var, mean_moderation: See `KernelMap`.
+        threads: Threads to spread the rays over.
+    """
+    # copies: the compiled march is one for plain writable arrays, and received ones are read-only
+    origins, directions, max_range_m = (
+        np.array(a, np.float64, order="C") for a in (origins, directions, max_range_m)
+    )
+    n = len(origins)
+    out = np.zeros((5, n))
+    quantile_m = np.zeros((n, len(quantiles)))
+    n_steps = count_steps(max_range_m, step_m)
+    widths = kernel_widths(index).astype(np.float32)
+    block = int(np.clip(_BLOCK_REACHES * index.median_reach_m / step_m, *_BLOCK_STEPS))
+    thresholds = -np.log1p(-np.asarray(quantiles, np.float64))
+
+    def run(span: tuple[int, int]) -> None:
+        _march(
+            span[0], span[1], origins, directions, max_range_m, n_steps, block, thresholds, float(unknown_rate),
+            -1.0 if width_m is None else float(width_m), float(observed_activation), float(residual_var),
+            float(mean_moderation), index.hinge, index.columns, widths, index.level_start, index.level_edge, index.level_cell,
+            index.level_size, index.keys, out, quantile_m,
+        )  # fmt: skip
+
+    parallel_map(run, spans(n, 8 * threads if threads > 1 else 1), threads, "query")
+    return FirstReturns(out[0], out[1], out[2], quantile_m, out[3], out[4])
+
+
+@nb.njit(error_model="numpy", cache=True)
+def _softplus(z: float) -> float:
+    return max(z, 0.0) + math.log1p(math.exp(-abs(z)))
+
+
+@nb.njit(nogil=True, fastmath=FAST, error_model="numpy", cache=True)
+def _sum_at(t, along, across2, minus_gamma, w, v, width, n):
+    mean = np.float32(0)
+    var = np.float32(0)
+    activation = np.float32(0)
+    weighted = np.float32(0)
+    for m in range(n):
+        d = t - along[m]
+        phi = exp32(minus_gamma[m] * (across2[m] + d * d))
+        mean += w[m] * phi
+        var += v[m] * phi * phi
+        activation += phi
+        weighted += width[m] * phi
+    return mean, var, activation, weighted
+
+
+@nb.njit(nogil=True, error_model="numpy", cache=True)
+def _march(
+    first, last, origins, directions, max_range_m, n_steps, block, thresholds, unknown_rate, fixed_width_m,
+    observed_activation, residual_var, mean_moderation, hinge, columns, widths, level_start, level_edge, level_cell,
+    level_size, keys, out, quantile_m,
+):  # fmt: skip
+    found = np.empty(4096, np.int64)
+    local = np.empty((6, 4096), np.float32)
+    lower = np.empty(3)
+    upper = np.empty(3)
+    middle = np.empty(3)
+    for i in range(first, last):
+        h = max_range_m[i] / n_steps[i]
+        hazard = 0.0  # its integral so far
+        survival = 1.0
+        length = 0.0  # integral of the survival: the mean
+        moment = 0.0  # integral of range times survival: half the second moment
+        unknown_length = 0.0
+        unknown_range = np.nan
+        k = 0  # the next quantile
+        step = 0
+        while step < n_steps[i] and survival >= _END_OF_RAY:
+            if step % block == 0:
+                stop = min(step + block, n_steps[i])
+                half = 0.5 * (stop - step) * h
+                centre = step * h + half
+                for c in range(3):
+                    middle[c] = origins[i, c] + centre * directions[i, c]
+                    lower[c] = middle[c] - half * abs(directions[i, c])
+                    upper[c] = middle[c] + half * abs(directions[i, c])
+                n_found, found = _gather(
+                    lower, upper, hinge, columns, level_start, level_edge, level_cell, level_size, keys, found
+                )
+                if n_found > local.shape[1]:
+                    local = np.empty((6, 2 * n_found), np.float32)
+                n = 0
+                for j in range(n_found):
+                    m = found[j]
+                    d2 = 0.0
+                    along = 0.0
+                    for c in range(3):
+                        d = hinge[m, c] - middle[c]
+                        d2 += d * d
+                        along += d * directions[i, c]
+                    across2 = max(d2 - along * along, 0.0)
+                    beyond = max(abs(along) - half, 0.0)
+                    if across2 + beyond * beyond <= columns[3, m] * columns[3, m]:
+                        local[0, n] = along
+                        local[1, n] = across2
+                        local[2, n] = columns[0, m]
+                        local[3, n] = columns[1, m]
+                        local[4, n] = columns[2, m]
+                        local[5, n] = widths[m]
+                        n += 1
+            r = step * h
+            step += 1
+            mean, var, activation, weighted = _sum_at(
+                np.float32(r + 0.5 * h - centre),
+                local[0],
+                local[1],
+                local[2],
+                local[3],
+                local[4],
+                local[5],
+                n,
+            )
+            if n > 0 and activation >= observed_activation:
+                is_known = True
+                s2 = var + residual_var * max(1.0 - activation, 0.0)
+                width = fixed_width_m if fixed_width_m > 0 else weighted / activation
+                rate = _softplus(mean / math.sqrt(1.0 + mean_moderation * math.pi / 8.0 * s2)) / width
+            else:
+                is_known = False
+                rate = unknown_rate
+                if math.isnan(unknown_range):
+                    unknown_range = r
+            if rate == np.inf:
+                hazard = np.inf
+                survival = 0.0
+                while k < len(thresholds):
+                    quantile_m[i, k] = r
+                    k += 1
+                break
+            passed = rate * h
+            while k < len(thresholds) and hazard + passed >= thresholds[k]:
+                quantile_m[i, k] = r + (thresholds[k] - hazard) / rate
+                k += 1
+            if passed > 1e-4:
+                stopped = -math.expm1(-passed)
+                piece = stopped / rate
+                inner = (stopped - passed * (1.0 - stopped)) / (rate * rate)
+            else:  # the series, where the formula would lose its digits
+                piece = h * (1.0 - 0.5 * passed)
+                inner = h * h * (0.5 - passed / 3.0)
+            length += survival * piece
+            moment += survival * (r * piece + inner)
+            if not is_known:
+                unknown_length += survival * piece
+            hazard += passed
+            survival = math.exp(-hazard)
+        while k < len(thresholds):
+            quantile_m[i, k] = max_range_m[i]
+            k += 1
+        out[0, i] = -math.expm1(-hazard)
+        out[1, i] = length
+        out[2, i] = math.sqrt(max(2.0 * moment - length * length, 0.0))
+        out[3, i] = unknown_range
+        if length > 0.0:
+            out[4, i] = unknown_length / length
+        else:  # it begins in unobserved space that stops it
+            out[4, i] = 1.0

@@ -1,0 +1,164 @@
+"""Weights of a map that is fitted again after every scan: a few Newton steps from where they are.
+
+    minimise  sum_n c_n (log(1 + exp(f_n)) - y_n f_n) + 1/2 sum_m (w_m - prior_mean_m)^2 / prior_var_m,    f = Phi w
+
+Unlike `logistic.fit_sparse` it does a fixed amount of work and is never far from the last optimum, but for where the world has
+changed. There plain Newton gets stuck: a row that is surely wrong has no curvature left, steps overshoot and every line search
+fails. Rows on the wrong side take the curvature of the quadratic bound of Jaakkola and Jordan (1997), with which no
+step overshoots, and every row has a least curvature.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numba as nb
+import numpy as np
+from numpy.typing import NDArray
+
+from potserver.numerics.feature_blocks import Blocks, gradient_and_diagonal, normal_product, product
+
+Float32 = NDArray[np.float32]
+Bool = NDArray[np.bool_]
+
+_LEAST_CURVATURE = np.float32(0.01)  # of a row that counts once
+_SHRINK, _TRIALS = 0.25, 12  # of the line search
+_ENOUGH = 1e-5  # relative gain of the objective below which more steps are not worth it
+
+
+class WarmFit(NamedTuple):
+    """Weights after some Newton steps, and how they ended."""
+
+    weights: Float32  # (K,) log-odds
+    var: Float32  # (K,) log-odds^2: 1 / diagonal of the Hessian at the last step, variance of each weight given the others
+    support: Float32  # (K,) what the data add to that diagonal
+    objective: float
+    objective_at_start: float
+    n_newton: int
+    converged: bool  # false: a step found nothing better although the gradient says so; the weights are the best found
+
+
+def warm_fit(
+    blocks: Blocks,
+    labels: Bool,
+    counts: Float32,
+    prior_mean: Float32,
+    prior_var: Float32,
+    start: Float32,
+    *,
+    free: Bool | None = None,
+    n_newton: int = 2,
+    n_conjugate_gradient: int = 4,
+    threads: int = 1,
+) -> WarmFit:
+    """Improve the weights of K kernels on N labelled rows.
+
+    Args:
+        blocks: Phi.
+        labels: (N,) true = occupied, in the order of the points that the blocks were built from.
+        counts: (N,) how much each row counts, >= 0, same order.
+        prior_mean: (K,) log-odds.
+        prior_var: (K,) log-odds^2, > 0.
+        start: (K,) log-odds: the weights as they are.
+        free: (K,) which weights may change; all by default. The others still count in f.
+        n_newton: Newton steps at most.
+        n_conjugate_gradient: Conjugate-gradient steps for each.
+        threads: Threads for the products with the features.
+    """
+    y, c = labels[blocks.order], np.ascontiguousarray(counts[blocks.order], np.float32)
+    precision = (1.0 / prior_var).astype(np.float32)
+    mask = np.ones(len(start), np.float32) if free is None else free.astype(np.float32)
+    w = start.astype(np.float32)
+    f = product(blocks, w, threads=threads)
+
+    def objective(change: Float32, step: Float32, size: float) -> float:
+        off = (w + np.float32(size) * step - prior_mean).astype(np.float64)
+        return float(
+            _loss(f, change, np.float32(size), y, c) + 0.5 * (precision * mask * np.square(off)).sum()
+        )
+
+    diagonal = precision
+    value = at_start = objective(f, np.zeros_like(w), 0.0)
+    steps, converged = 0, True
+    while steps < n_newton:
+        residual, curvature = _terms(f, y, c)
+        gradient, diagonal = gradient_and_diagonal(blocks, residual, curvature, threads=threads)
+        diagonal = diagonal + precision
+        gradient = (gradient + precision * (w - prior_mean)) * mask
+        step = _conjugate_gradient(
+            lambda d, curvature=curvature: (
+                (normal_product(blocks, curvature, d, threads=threads) + precision * d) * mask
+            ),
+            -gradient, diagonal, n_conjugate_gradient,
+        )  # fmt: skip
+        slope = float(gradient @ step)
+        if slope >= 0.0:
+            break  # nothing to gain
+        steps += 1
+        change = product(blocks, step, threads=threads)
+        size, trial = 1.0, np.inf
+        for _ in range(_TRIALS):
+            trial = objective(change, step, size)
+            if trial <= value + 1e-4 * size * slope:
+                break
+            size *= _SHRINK
+        else:
+            converged = -slope <= _ENOUGH * max(1.0, abs(value))  # float32 has nothing left to gain
+            break
+        w = w + np.float32(size) * step
+        f = f + np.float32(size) * change
+        gain, value = value - trial, trial
+        if gain <= _ENOUGH * max(1.0, abs(value)):
+            break
+    return WarmFit(w, 1.0 / diagonal, diagonal - precision, value, at_start, steps, converged)
+
+
+def _conjugate_gradient(apply, rhs: Float32, diagonal: Float32, n_steps: int) -> Float32:
+    """A few steps towards A x = rhs, with a Jacobi preconditioner; fewer once the residual has shrunk to a tenth."""
+    x = np.zeros_like(rhs)
+    r = rhs.copy()
+    z = r / diagonal
+    d = z.copy()
+    rz = float(r @ z)
+    limit = 0.01 * rz
+    for _ in range(n_steps):
+        if rz <= 0.0:
+            break
+        q = apply(d)
+        alpha = rz / float(d @ q)
+        x += np.float32(alpha) * d
+        r -= np.float32(alpha) * q
+        z = r / diagonal
+        rz, last = float(r @ z), rz
+        if rz <= limit:
+            break
+        d = z + np.float32(rz / last) * d
+    return x
+
+
+@nb.njit(nogil=True, error_model="numpy", cache=True)
+def _terms(f, y, c):
+    residual = np.empty(len(f), np.float32)
+    curvature = np.empty(len(f), np.float32)
+    one, half = np.float32(1), np.float32(0.5)
+    for i in range(len(f)):
+        x = f[i]
+        e = np.exp(-abs(x))
+        p = one / (one + e) if x >= 0 else e / (one + e)
+        residual[i] = c[i] * (p - one if y[i] else p)
+        q = p * (one - p)
+        if y[i] != (x > 0) and abs(x) > np.float32(0.01):
+            q = (p - half) / x
+        curvature[i] = c[i] * max(q, _LEAST_CURVATURE)
+    return residual, curvature
+
+
+@nb.njit(nogil=True, error_model="numpy", cache=True)
+def _loss(f, change, size, y, c):
+    total = 0.0
+    for i in range(len(f)):
+        x = f[i] + size * change[i]
+        if not y[i]:
+            x = -x
+        total += c[i] * (max(-x, np.float32(0)) + np.log1p(np.exp(-abs(x))))
+    return total

@@ -1,0 +1,241 @@
+"""A scan enters the overall map: its samples become evidence, kernels are put where they are missing, and weights follow."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from potserver.domain.tiles import (
+    CARRIED,
+    COARSE,
+    FINE,
+    MapKernels,
+    Region,
+    Tile,
+    TiledMap,
+    TileGrid,
+    TileIndex,
+)
+from potserver.domain.types import Bool, Float32, Float64, KernelSet
+from potserver.errors import SolverError
+from potserver.numerics import evidence
+from potserver.numerics.beams import Beams, LabelledPoints, beam_weights
+from potserver.numerics.feature_blocks import feature_blocks, gradient_and_diagonal
+from potserver.numerics.lattice_nodes import new_nodes
+from potserver.numerics.warm_fit import warm_fit
+from potserver.services.refinement import activation, gamma_of_spacing, kernels_at
+from potserver.services.settings import MappingSettings
+
+_FINEST_M, _COARSEST_M, _FINE_PER_RANGE = 0.2, 0.4, 1.0 / 20.0
+_COARSE_REACH = 1.0  # spacings: nearer coarse nodes than this get a kernel, see lattice_nodes.new_nodes
+_FADE_EVERY = 2  # beams of which one is followed, for what it passes through
+_TOO_WIDE = 1.5  # coarse spacings
+_EXPLAINED = 1.0  # activation by carried kernels at which the lattice adds none
+_UNSUPPORTED = 1e-5  # of a kernel's curvature: what no row within its reach leaves
+
+
+class Fused(NamedTuple):
+    """What a scan makes of the map."""
+
+    tiles: dict[TileIndex, Tile]  # those that are new or other than before
+    n_added: int
+    n_transported: int  # of those added
+    converged: bool
+
+
+def grid_for(beams: Beams, settings: MappingSettings) -> TileGrid:
+    """The grid of a map that starts with these beams: far looks are spread thinly and need wider kernels."""
+    fine = settings.fine_m
+    if not fine:
+        length = np.linalg.norm(beams.ends[beams.is_return] if beams.is_return.any() else beams.ends, axis=1)
+        fine = float(np.clip(_FINE_PER_RANGE * np.median(length), _FINEST_M, _COARSEST_M))
+    return TileGrid.of(settings.tile_size_m, fine)
+
+
+def fuse(
+    tiled: TiledMap,
+    labelled: LabelledPoints,
+    beams: Beams,
+    origin: Float64,
+    carried: KernelSet,
+    settings: MappingSettings,
+    *,
+    planar: bool,
+    threads: int,
+) -> Fused:
+    """Add a scan to the tiles around it, and solve all weights near it jointly on all evidence there.
+
+    Args:
+        tiled: The map; it is not changed.
+        labelled: The scan's points, map frame.
+        beams: The scan's beams, relative to `origin`.
+        origin: (3,) m, map frame.
+        carried: Transported kernels, map frame; weights and variances as prior.
+        settings: Of the pipeline.
+        planar: Keep kernels in the plane of the points.
+        threads: Threads of the solve.
+    Raises:
+        SolverError: the solve ended without numbers.
+        SettingsError: the scan is too wide for the resolution.
+    """
+    grid = tiled.grid
+    pad = grid.coarse_m
+    lower, upper = labelled.points.min(axis=0) - pad, labelled.points.max(axis=0) + pad
+    region = Region.of(tiled, lower - 4 * pad, upper + 4 * pad)
+    points = labelled.points - region.origin_m
+    if settings.fade_rate:
+        start = origin - region.origin_m
+        evidence.fade(
+            region.rows, beams.ends + start, beams.is_return, start, fine_m=grid.fine_m,
+            rate=settings.fade_rate, gap_m=settings.gap_m, every=_FADE_EVERY, threads=threads,
+        )  # fmt: skip
+    new_rows = _add_evidence(region, points, labelled, settings)
+    added = _add_kernels(region, new_rows, points, carried.moved(-region.origin_m), planar, settings, threads)
+    fitted = _fit(region, lower - region.origin_m, upper - region.origin_m, settings, threads)
+    return Fused(region.tiles(lower, upper), len(added), int((added.level == CARRIED).sum()), fitted)
+
+
+def _add_evidence(
+    region: Region, points: Float64, labelled: LabelledPoints, settings: MappingSettings
+) -> evidence.Rows:
+    """Put the samples into the region's rows; the rows that are new."""
+    n_before = len(region.rows.occupied)
+    rows, gained = evidence.add(
+        region.rows, points, labelled.occupied, beam_weights(labelled), region.grid.fine_m
+    )
+    evidence.forget(rows.sums, gained, evidence.cells(rows), settings.memory)
+    region.rows = rows
+    return rows.take(slice(n_before, None))
+
+
+def _add_kernels(
+    region: Region,
+    new_rows: evidence.Rows,
+    points: Float64,
+    carried: KernelSet,
+    planar: bool,
+    settings: MappingSettings,
+    threads: int,
+) -> MapKernels:
+    """Put kernels where the new rows ask for them, carried ones first; those that were added."""
+    grid, present = region.grid, region.kernels
+    asking = evidence.positions(new_rows, grid.fine_m)
+    taken = _wanted(carried, present, points, grid, threads) if settings.carry_into_map else KernelSet.empty()
+    parts = [MapKernels.new(taken, CARRIED)]
+    from_atoms = KernelSet.concatenate([present.kernels.take(present.level == CARRIED), taken])
+    for level, spacing, within in ((COARSE, grid.coarse_m, _COARSE_REACH), (FINE, grid.fine_m, 0.0)):
+        there = present.kernels.hinge_mean[present.level == level]
+        nodes = new_nodes(
+            asking if level == COARSE else asking[new_rows.occupied],
+            there,
+            spacing,
+            within=within,
+            planar=planar,
+        )
+        same_scale = from_atoms.take(_is_fine(from_atoms, grid) == (level == FINE))
+        if len(same_scale) and len(nodes):
+            nodes = nodes[activation(same_scale, nodes, threads=threads) < _EXPLAINED]
+        parts.append(MapKernels.new(kernels_at(nodes, spacing, settings.prior_var), level))
+    added = MapKernels.concatenate(parts)
+    added = added.take(
+        _fits_budget(
+            present.kernels.hinge_mean, added.kernels.hinge_mean, grid, settings.max_kernels_per_tile
+        )
+    )
+    region.kernels = MapKernels.concatenate([present, added])
+    return added
+
+
+def _wanted(
+    carried: KernelSet, present: MapKernels, points: Float64, grid: TileGrid, threads: int
+) -> KernelSet:
+    """The transported kernels that the map takes: where the scan has data for them and no atom has explained them before.
+
+    Those much wider than the map's own are left out, they would only make the solve harder.
+    """
+    carried = carried.take(carried.gamma >= gamma_of_spacing(_TOO_WIDE * grid.coarse_m))
+    if len(carried) == 0:
+        return carried
+    blocks = feature_blocks(
+        points, carried.hinge_mean, carried.gamma, edge_m=grid.coarse_m, cut=0.1, threads=threads
+    )
+    ones = np.ones(len(points), np.float32)
+    support, _ = gradient_and_diagonal(blocks, ones, ones, threads=threads)
+    carried = carried.take(support >= 1.0)
+    before = present.kernels.take(present.level == CARRIED)
+    explained = np.zeros(len(carried), bool)
+    for fine in (False, True):
+        members = _is_fine(carried, grid) == fine
+        same_scale = before.take(_is_fine(before, grid) == fine)
+        explained[members] = (
+            activation(same_scale, carried.hinge_mean[members], threads=threads) >= _EXPLAINED
+        )
+    return carried.take(~explained)
+
+
+def _is_fine(kernels: KernelSet, grid: TileGrid) -> Bool:
+    """(K,) which kernels are nearer to the fine lattice's width than to the coarse one's, by ratio."""
+    return kernels.gamma > np.sqrt(gamma_of_spacing(grid.coarse_m) * gamma_of_spacing(grid.fine_m))
+
+
+def _fits_budget(present: Float64, added: Float64, grid: TileGrid, limit: int) -> Bool:
+    """(A,) which added kernels their tile has room for, in their order."""
+    tile = np.floor(np.concatenate([present, added]) / grid.size_m).astype(np.int64)
+    tile -= tile.min(axis=0, initial=0)
+    size = tile.max(axis=0, initial=0) + 1
+    number = (tile[:, 0] * size[1] + tile[:, 1]) * size[2] + tile[:, 2]
+    order = np.argsort(number, kind="stable")
+    first = np.searchsorted(number[order], number[order])
+    place = np.empty(len(number), np.int64)
+    place[order] = np.arange(len(number)) - first
+    return place[len(present) :] < limit
+
+
+def _fit(region: Region, lower: Float64, upper: Float64, settings: MappingSettings, threads: int) -> bool:
+    """Solve the weights of the kernels in a box, those around it held; whether the solve went well.
+
+    Rows and kernels beyond the reach of what is solved for are left out.
+    """
+    grid, kernels = region.grid, region.kernels.kernels
+    pad = grid.coarse_m
+    where = evidence.positions(region.rows, grid.fine_m)
+    rows = np.flatnonzero(_inside(where, lower - 2 * pad, upper + 2 * pad) & evidence.is_alive(region.rows))
+    local = np.flatnonzero(_inside(kernels.hinge_mean, lower - 4 * pad, upper + 4 * pad))
+    hinge = kernels.hinge_mean[local]
+    free = _inside(hinge, lower, upper)
+    counts = evidence.counts(region.rows.sums, evidence.cells(region.rows), settings.saturation)
+    blocks = feature_blocks(
+        where[rows],
+        hinge,
+        kernels.gamma[local],
+        edge_m=grid.coarse_m,
+        cut=settings.feature_cut,
+        threads=threads,
+    )
+    per_step = blocks.n_values * (2 + 2 * settings.gradient_steps)
+    cheap = settings.cheap_values // max(per_step, 1)
+    fit = warm_fit(
+        blocks, region.rows.occupied[rows], counts[rows], region.kernels.prior_mean[local],
+        region.kernels.prior_var[local], kernels.weight_mean[local], free=free,
+        n_newton=int(np.clip(cheap, settings.newton_steps, 3 * settings.newton_steps)),
+        n_conjugate_gradient=settings.gradient_steps, threads=threads,
+    )  # fmt: skip
+    if not (np.isfinite(fit.weights).all() and np.isfinite(fit.var).all()):
+        raise SolverError(f"the weights of {len(local)} kernels on {len(rows)} rows came out NaN or infinite")
+    mean, var = kernels.weight_mean.copy(), kernels.weight_var.copy()
+    solved = local[free]
+    mean[solved], var[solved] = fit.weights[free], fit.var[free]
+    keep = np.ones(len(kernels), bool)
+    keep[local[free & (fit.support < _UNSUPPORTED)]] = False
+    region.kernels = MapKernels(
+        kernels=kernels.replace(weight_mean=mean, weight_var=var),
+        level=region.kernels.level,
+        prior_mean=region.kernels.prior_mean,
+        prior_var=region.kernels.prior_var,
+    ).take(keep)
+    return fit.converged
+
+
+def _inside(points: Float64 | Float32, lower: Float64, upper: Float64) -> Bool:
+    return np.asarray(((points >= lower) & (points <= upper)).all(axis=1))

@@ -1,0 +1,234 @@
+"""The dictionary as a robot sees it: list, fetch, add, remove, over a real Zenoh session, while maps are built from it."""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+
+from potclient import Atom, AtomRefusedError, MapClient, ReadOnlyError, UnknownAtomError
+from potclient.errors import InternalError, ShapeError
+from potserver.config import load_settings
+from potserver.domain.dictionary import AtomDictionary
+from potserver.server import MapServer
+
+FAST = {"mapping.max_range_m": 15.0, "mapping.beams_per_scan": 600, "threads": 1}
+ORIGIN = np.eye(4)
+
+Serve = Callable[..., MapClient]
+
+
+@pytest.fixture
+def serve() -> Iterator[Serve]:
+    """Starts servers with the real mapper, and gives a client of each; keywords are dotted settings with `__` for the dot."""
+    with contextlib.ExitStack() as stack:
+
+        def start(*, map_id: str = "default", **changes: Any) -> MapClient:
+            overrides = FAST | {key.replace("__", "."): value for key, value in changes.items()}
+            server = stack.enter_context(
+                MapServer(load_settings(overrides=overrides), listen="tcp/127.0.0.1:0")
+            )
+            client = MapClient(server.endpoint, map=map_id, timeout_s=60.0)
+            client.wait_ready()
+            return stack.enter_context(client)
+
+        yield start
+
+
+@pytest.fixture
+def site(tmp_path: Path) -> Path:
+    """A dictionary file of four atoms."""
+    path = tmp_path / "site.atoms"
+    AtomDictionary(AtomDictionary.builtin().of_dims(3).atoms[:4]).save(path)
+    return path
+
+
+def room(seed: int = 0) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    angle = rng.uniform(-np.pi, np.pi, 600)
+    walls = [6 * np.cos(angle), 5 * np.sin(angle), rng.uniform(-1, 2, 600)]
+    return np.stack(walls, axis=1).astype(np.float32)
+
+
+def names(client: MapClient) -> list[str]:
+    return [info.atom_id for info in client.atoms()]
+
+
+def on_disk(path: Path) -> list[str]:
+    return [atom.atom_id for atom in AtomDictionary.load(path)]
+
+
+def mirrored(atom: Atom, atom_id: str) -> Atom:
+    """As sound as the original, and not a duplicate of it."""
+    flip = np.array([1, -1, 1], np.float32)
+    hinges = atom.kernels.hinge_mean * flip
+    return Atom(
+        info=msgspec.structs.replace(atom.info, atom_id=atom_id),
+        hit_points=atom.hit_points * flip,
+        free_points=atom.free_points * flip,
+        kernels=type(atom.kernels)(
+            **{
+                name: getattr(atom.kernels, name)
+                for name in atom.kernels.__dataclass_fields__
+                if name != "hinge_mean"
+            },
+            hinge_mean=hinges,
+        ),
+    )
+
+
+def test_an_atom_that_was_taken_out_can_be_put_back(serve: Serve, site: Path) -> None:
+    client = serve(dictionary=str(site))
+    before = names(client)
+    assert len(before) == client.info().n_atoms == 4
+    atom = client.atom(before[0])
+    gone = client.remove_atom(before[0])
+    assert (gone.atom_id, gone.n_atoms, gone.persisted) == (before[0], 3, False)
+    with pytest.raises(UnknownAtomError):
+        client.atom(before[0])
+    with pytest.raises(UnknownAtomError):
+        client.remove_atom(before[0])
+    assert names(client) == before[1:]
+    assert client.info().n_atoms == 3
+
+    assert client.add_atom(atom).n_atoms == 4
+    assert names(client) == [*before[1:], before[0]]
+    back = client.atom(before[0])
+    assert back.info == atom.info
+    np.testing.assert_array_equal(back.hit_points, atom.hit_points)
+    np.testing.assert_allclose(back.kernels.hinge_mean, atom.kernels.hinge_mean, atol=2e-6)
+    counters = client.stats().counters
+    assert (counters["atoms.added"], counters["atoms.removed"]) == (1, 1)
+    assert counters["atoms.refused.unknown_atom"] == 1
+    assert on_disk(site) == before, "changes stay in memory unless the operator says otherwise"
+
+
+def test_a_refused_atom_changes_nothing_and_says_why(serve: Serve, site: Path) -> None:
+    client = serve(dictionary=str(site))
+    before = names(client)
+    atom = client.atom(before[0])
+    rename = msgspec.structs.replace
+    again = Atom(
+        info=rename(atom.info, atom_id="again"),
+        hit_points=atom.hit_points,
+        free_points=atom.free_points,
+        kernels=atom.kernels,
+    )
+    for refused, reason in (
+        (atom, "taken_id"),
+        (again, "duplicate"),
+        (mirrored(atom, "Not Legal"), "illegal_id"),
+    ):
+        with pytest.raises(AtomRefusedError) as caught:
+            client.add_atom(refused)
+        assert caught.value.reason == reason
+        assert not caught.value.retryable
+        assert client.stats().counters[f"atoms.refused.{reason}"] == 1
+    miscounted = Atom(
+        info=rename(atom.info, n_hits=7),
+        hit_points=atom.hit_points,
+        free_points=atom.free_points,
+        kernels=atom.kernels,
+    )
+    with pytest.raises(ShapeError):
+        client.add_atom(miscounted)
+    assert names(client) == before
+    assert client.add_atom(mirrored(atom, "mirrored")).n_atoms == len(before) + 1
+
+
+def test_a_read_only_server(serve: Serve, site: Path) -> None:
+    client = serve(dictionary=str(site), atoms__writable=False)
+    before = names(client)
+    atom = client.atom(before[0])
+    with pytest.raises(ReadOnlyError):
+        client.remove_atom(before[0])
+    with pytest.raises(ReadOnlyError):
+        client.add_atom(mirrored(atom, "mirrored"))
+    assert names(client) == before
+    assert client.stats().counters["atoms.refused.read_only"] == 2
+
+
+def test_saved_changes_outlive_the_server(serve: Serve, site: Path) -> None:
+    client = serve(dictionary=str(site), atoms__save=True)
+    before = names(client)
+    atom = client.atom(before[1])
+    assert client.add_atom(mirrored(atom, "mirrored")).persisted
+    assert on_disk(site) == [*before, "mirrored"], "on the disk before the reply came"
+    assert client.remove_atom(before[0]).persisted
+    expected = [*before[1:], "mirrored"]
+    assert on_disk(site) == expected
+    second = serve(dictionary=str(site))
+    assert names(second) == expected
+    np.testing.assert_array_equal(
+        second.atom("mirrored").hit_points, atom.hit_points * np.array([1, -1, 1], np.float32)
+    )
+
+
+def test_a_disk_that_refuses_leaves_the_dictionary_as_it_was(serve: Serve, site: Path) -> None:
+    client = serve(dictionary=str(site), atoms__save=True)
+    before = names(client)
+    site.with_name("site.atoms.partial").mkdir()  # where the new file would be written
+    with pytest.raises(InternalError, match="cannot write"):
+        client.remove_atom(before[0])
+    assert names(client) == on_disk(site) == before
+
+
+def test_all_maps_of_a_server_share_the_dictionary(serve: Serve, site: Path) -> None:
+    client = serve(dictionary=str(site), maps=["one", "two"], map_id="one")
+    before = names(client)
+    client.remove_atom(before[0])
+    with MapClient(client._where, map="two", timeout_s=60.0) as other:
+        other.wait_ready()
+        assert names(other) == before[1:]
+        assert other.remove_atom(before[1]).n_atoms == 2
+    assert names(client) == before[2:]
+
+
+def test_changes_while_clouds_come_in_lose_nothing(serve: Serve, site: Path) -> None:
+    """Two robots send, one operator adds and removes: every cloud is mapped, every change counts, scans use the new atoms."""
+    client = serve(dictionary=str(site), atoms__save=True)
+    before = names(client)
+    originals = [client.atom(name) for name in before]
+    changed = threading.Event()
+    accepted: list[int] = []
+    failures: list[BaseException] = []
+
+    def send(robot: str) -> None:
+        try:
+            n = 0
+            while not (changed.is_set() and n >= 3):
+                accepted.append(client.integrate(room(n), ORIGIN, robot=robot).map_revision)
+                n += 1
+        except BaseException as error:
+            failures.append(error)
+
+    robots = [threading.Thread(target=send, args=(f"r{i}",)) for i in range(2)]
+    for robot in robots:
+        robot.start()
+    try:
+        for number, atom in enumerate(originals):
+            client.add_atom(mirrored(atom, f"mirrored-{number}"))
+        for name in before:
+            client.remove_atom(name)
+    finally:
+        changed.set()
+        for robot in robots:
+            robot.join()
+    assert failures == []
+    expected = [f"mirrored-{i}" for i in range(len(originals))]
+    assert names(client) == on_disk(site) == expected
+    assert sorted(accepted) == list(range(1, len(accepted) + 1)), "each cloud made one revision of the map"
+    counters = client.stats().counters
+    assert counters["clouds.accepted"] == len(accepted)
+    assert (counters["atoms.added"], counters["atoms.removed"]) == (4, 4)
+    receipt = client.integrate(room(99), ORIGIN, robot="r0")
+    served = {sector.atom_id for sector in receipt.sectors} - {None}
+    assert served
+    assert served <= set(expected)
+    assert sum(info.times_used for info in client.atoms()) > 0

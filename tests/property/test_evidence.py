@@ -1,0 +1,80 @@
+"""Evidence against a dictionary of voxels: whatever is added or taken off, rows are the weighted means of their samples."""
+
+from __future__ import annotations
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+from potserver.numerics.evidence import Rows, add, positions
+
+FINE_M = 0.4
+
+
+def _samples(seed: int, n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    return rng.uniform(-2.0, 3.0, (n, 3)), rng.random(n) < 0.4, rng.choice([1.0, 1 / 3, 0.25], n)
+
+
+def _reference(points, occupied, weight) -> dict[tuple, np.ndarray]:
+    """Voxel and label -> (sum w x, sum w y, sum w z, sum w), float64."""
+    sums: dict[tuple, np.ndarray] = {}
+    for p, y, w in zip(points, occupied, weight, strict=True):
+        edge = FINE_M / 2 if y else FINE_M
+        key = (bool(y), *np.floor(p / edge).astype(int).tolist())
+        sums[key] = sums.get(key, np.zeros(4)) + w * np.append(p, 1.0)
+    return sums
+
+
+def _as_dict(rows: Rows) -> dict[tuple, np.ndarray]:
+    where = positions(rows, FINE_M)
+    return {
+        (bool(y), *voxel.tolist()): np.append(w * p, w)
+        for y, voxel, p, w in zip(
+            rows.occupied, rows.voxel, where, rows.sums[:, 3].astype(float), strict=True
+        )
+    }
+
+
+def _check_same(one: dict[tuple, np.ndarray], other: dict[tuple, np.ndarray]) -> None:
+    assert one.keys() == other.keys()
+    for key, sums in one.items():
+        np.testing.assert_allclose(sums, other[key], atol=1e-4)
+
+
+@given(seed=st.integers(0, 2**31), n=st.integers(0, 300), parts=st.integers(1, 4))
+def test_rows_are_what_a_dictionary_would_hold(seed: int, n: int, parts: int) -> None:
+    points, occupied, weight = _samples(seed, n)
+    rows, gained = Rows.empty(), np.zeros(0, np.float32)
+    for part in np.array_split(np.arange(n), parts):
+        before = rows
+        rows, gained = add(rows, points[part], occupied[part], weight[part], FINE_M)
+        np.testing.assert_array_equal(rows.voxel[: len(before.occupied)], before.voxel)
+        assert gained.sum() == np.float32(weight[part].sum()) or abs(gained.sum() - weight[part].sum()) < 1e-3
+    _check_same(_as_dict(rows), _reference(points, occupied, weight))
+
+
+@given(seed=st.integers(0, 2**31), n=st.integers(1, 200), m=st.integers(1, 200))
+def test_what_was_added_can_be_taken_off_again(seed: int, n: int, m: int) -> None:
+    mine, theirs = _samples(seed, n), _samples(seed + 1, m)
+    alone, _ = add(Rows.empty(), *mine, FINE_M)
+    both, _ = add(alone, *theirs, FINE_M)
+    undone, gained = add(both, theirs[0], theirs[1], -theirs[2], FINE_M)
+    assert gained.sum() <= 0
+    left = undone.take(undone.sums[:, 3] > 1e-3)
+    _check_same(_as_dict(left), _as_dict(alone))
+
+
+@given(seed=st.integers(0, 2**31), n=st.integers(1, 200), m=st.integers(1, 200))
+def test_rows_of_another_map_merge_as_weighted_points(seed: int, n: int, m: int) -> None:
+    mine, theirs = _samples(seed, n), _samples(seed + 1, m)
+    alone, _ = add(Rows.empty(), *mine, FINE_M)
+    other, _ = add(Rows.empty(), *theirs, FINE_M)
+    # a mean may leave its voxel by rounding alone, at an edge
+    inside = np.floor(positions(other, FINE_M) / np.where(other.occupied, FINE_M / 2, FINE_M)[:, None])
+    kept = other.take((inside == other.voxel).all(axis=1))
+    merged, _ = add(alone, positions(kept, FINE_M), kept.occupied, kept.sums[:, 3], FINE_M)
+    truth = _as_dict(alone)
+    for key, sums in _as_dict(kept).items():
+        truth[key] = truth.get(key, np.zeros(4)) + sums
+    _check_same(_as_dict(merged), truth)
