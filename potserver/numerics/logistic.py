@@ -2,8 +2,8 @@
 
     maximise  sum_n log p(y_n | f_n) - 1/2 sum_m (w_m - prior_mean_m)^2 / prior_var_m,    f_n = offset_n + sum_m w_m phi_m(x_n)
 
-`fit_sparse` is for maps at run time: Newton steps whose linear systems are solved by conjugate gradients on sparse features.
-`fit_dense` is for learning atoms offline: exact Newton by Cholesky in float64, with the log evidence that picks the prior.
+`fit_sparse` is for maps at run time and for learning atoms: Newton steps whose linear systems are solved by conjugate gradients on sparse features.
+`fit_dense` is what it is held to: exact Newton by Cholesky in float64, with the log evidence.
 Both keep the prior fixed and count every datum once; the RSS 2020 code does neither, and its diagonal updates overshoot.
 """
 
@@ -261,7 +261,7 @@ def fit_dense(
         device: Where torch computes.
     Source: Laplace approximation of Bayesian logistic regression, MacKay 1992.
     """
-    import torch  # here and not above: it takes seconds to load, and only learning needs it
+    import torch  # here and not above: it takes seconds to load, and servers do without it
 
     phi = torch.as_tensor(features, dtype=torch.float64, device=device)
     y = torch.as_tensor(labels, device=device).to(torch.float64)
