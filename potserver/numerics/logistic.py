@@ -2,7 +2,8 @@
 
     maximise  sum_n log p(y_n | f_n) - 1/2 sum_m (w_m - prior_mean_m)^2 / prior_var_m,    f_n = offset_n + sum_m w_m phi_m(x_n)
 
-`fit_sparse` is for maps at run time and for learning atoms: Newton steps whose linear systems are solved by conjugate gradients on sparse features.
+`fit_sparse` is for maps at run time and for learning atoms: Newton steps whose linear systems are solved by conjugate
+gradients on sparse features.
 `fit_dense` is what it is held to: exact Newton by Cholesky in float64, with the log evidence.
 Both keep the prior fixed and count every datum once; the RSS 2020 code does neither, and its diagonal updates overshoot.
 """
