@@ -39,7 +39,9 @@ def values(kind: mi.Type) -> st.SearchStrategy[Any]:
         return st.integers(kind.ge, kind.le)
     if isinstance(kind, mi.FloatType):
         low = kind.ge if kind.ge is not None else kind.gt
-        return st.floats(low, kind.le, exclude_min=kind.gt is not None, width=64)
+        high = kind.le if kind.le is not None else kind.lt
+        outside = {"exclude_min": kind.gt is not None, "exclude_max": kind.lt is not None}
+        return st.floats(low, high, width=64, **outside)
     if isinstance(kind, mi.StrType):
         return st.from_regex(kind.pattern, fullmatch=True) if kind.pattern else st.text(max_size=20)
     if isinstance(kind, mi.EnumType):
