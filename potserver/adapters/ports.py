@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, Protocol
 
 import numpy as np
@@ -17,6 +17,7 @@ from potserver.domain.types import (
     PathRisk,
     RayReturns,
     Scan,
+    TileChange,
     Unknown,
 )
 from potserver.services.settings import MappingSettings
@@ -44,8 +45,8 @@ class Snapshot(Protocol):
 class Mapper(Protocol):
     """The one writer of a map, and its readable state."""
 
-    def integrate(self, scan: Scan) -> MapUpdate: ...
-    def clear(self) -> None: ...
+    def integrate(self, scan: Scan, *, commit: Callable[[], None] | None = None) -> MapUpdate: ...
+    def clear(self) -> TileChange: ...
     def warm_up(self) -> None: ...
     def use_dictionary(self, dictionary: AtomDictionary) -> None: ...
     @property

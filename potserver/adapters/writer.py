@@ -5,8 +5,6 @@ from __future__ import annotations
 import collections
 import time
 
-import numpy as np
-
 from potserver.adapters import codec
 from potserver.adapters.intake import CloudJob, IntakeQueue
 from potserver.adapters.limits import Limits
@@ -15,7 +13,7 @@ from potserver.adapters.ports import Mapper
 from potserver.adapters.poses import PoseBuffer
 from potserver.adapters.receipts import ReceiptSender
 from potserver.adapters.stamps import check_not_future
-from potserver.domain.types import Float64, Scan, TileChange
+from potserver.domain.types import Float64, Scan
 from potserver.errors import OldStampError, PotserverError
 from potserver.services.health import Health
 
@@ -62,18 +60,11 @@ class MapWriter:
 
     def clear(self) -> None:
         """Empty the map and tell the planners; runs on the writer thread, as a barrier."""
-        former = self._mapper.snapshot.kernels.hinge_mean
-        self._mapper.clear()
+        changed = self._mapper.clear()
         self._last_stamps.clear()  # the same log may be replayed into the empty map
         self._health.count("maps.cleared")
-        size = self._mapper.settings.tile_size_m
-        tiles = np.unique(np.floor(former / size).astype(np.int64), axis=0)
         snapshot = self._mapper.snapshot
-        self._receipts.tick(
-            snapshot.map_revision,
-            len(snapshot),
-            TileChange(size, [(int(x), int(y), int(z)) for x, y, z in tiles]),
-        )
+        self._receipts.tick(snapshot.map_revision, len(snapshot), changed)
         log.info("map_cleared", map_id=self._map_id)
 
     def _integrate(self, job: CloudJob) -> None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from potserver.domain.kernel_map import IndexedKernels
 from potserver.domain.types import Bool, Float32, Float64, KernelSet
 from potserver.errors import SettingsError, ShapeError
-from potserver.numerics.evidence import Rows, is_alive
+from potserver.numerics.evidence import Rows, decay, is_alive
 from potserver.numerics.voxel_hash import CELL_LIMIT
 
 TileIndex = tuple[int, int, int]  # floor(p_map / tile_size_m)
@@ -92,6 +92,13 @@ class Tile(NamedTuple):
 
     rows: Rows
     kernels: MapKernels
+    revision: int = 0  # of the map, when the tile was made
+    stamp_ns: int = 0  # map time at which the rows weigh what they say
+
+    @property
+    def is_empty(self) -> bool:
+        """Nothing was ever seen here, or it is forgotten."""
+        return len(self.rows.occupied) == 0 and len(self.kernels) == 0
 
 
 class TileGrid(NamedTuple):
@@ -136,25 +143,30 @@ class TiledMap(NamedTuple):
     grid: TileGrid
     tiles: Mapping[TileIndex, Tile]
     parts: Mapping[TileIndex, IndexedKernels]  # kernels of some tiles together, map frame, ready to be asked
+    robots: tuple[str, ...] = ()  # whose the rows are: `Rows.source` numbers them
 
     @staticmethod
     def empty(grid: TileGrid) -> TiledMap:
         """A map without tiles."""
         return TiledMap(grid, {}, {})
 
+    def with_robot(self, robot_id: str) -> tuple[TiledMap, int]:
+        """The map with a robot in its list, and the robot's number."""
+        if robot_id in self.robots:
+            return self, self.robots.index(robot_id)
+        return self._replace(robots=(*self.robots, robot_id)), len(self.robots)
+
     def with_tiles(self, changed: Mapping[TileIndex, Tile], observed_activation: float) -> TiledMap:
         """The map with some tiles exchanged, or gone if they are empty; only the parts that they lie in are indexed again."""
         tiles = dict(self.tiles)
         for index, tile in changed.items():
-            if len(tile.rows.occupied) or len(tile.kernels):
-                tiles[index] = tile
-            else:
+            if tile.is_empty:
                 tiles.pop(index, None)
+            else:
+                tiles[index] = tile
         parts = dict(self.parts)
-        for number in dict.fromkeys(_part_of(index) for index in changed):
-            corner = [_PART * n for n in number]
-            around = itertools.product(*(range(c, c + _PART) for c in corner))
-            found = [(x, y, z) for x, y, z in around if (x, y, z) in tiles]
+        for number in dict.fromkeys(part_of(index) for index in changed):
+            found = [index for index in tiles_of_part(number) if index in tiles]
             members = [tiles[index].kernels.kernels for index in found]
             shift = np.repeat(np.reshape(found, (-1, 3)), [len(m) for m in members], axis=0)
             if not members:
@@ -162,12 +174,19 @@ class TiledMap(NamedTuple):
                 continue
             kernels = KernelSet.concatenate(members).moved(np.asarray(shift * self.grid.size_m, np.float64))
             parts[number] = IndexedKernels.of(kernels, observed_activation)
-        return TiledMap(self.grid, tiles, parts)
+        return self._replace(tiles=tiles, parts=parts)
 
 
-def _part_of(index: TileIndex) -> TileIndex:
+def part_of(index: TileIndex) -> TileIndex:
+    """The part that a tile is indexed in."""
     x, y, z = index
     return x // _PART, y // _PART, z // _PART
+
+
+def tiles_of_part(number: TileIndex) -> list[TileIndex]:
+    """All tiles of a part, whether the map has them or not."""
+    x, y, z = (range(_PART * n, _PART * (n + 1)) for n in number)
+    return list(itertools.product(x, y, z))
 
 
 @dataclasses.dataclass(slots=True, eq=False, kw_only=True)
@@ -181,12 +200,15 @@ class Region:
     kernels: MapKernels
 
     @staticmethod
-    def of(tiled: TiledMap, lower_m: Float64, upper_m: Float64) -> Region:
+    def of(
+        tiled: TiledMap, lower_m: Float64, upper_m: Float64, age: Callable[[Tile], float] | None = None
+    ) -> Region:
         """Copy the tiles that a box of the map touches.
 
         Args:
             tiled: The map.
             lower_m, upper_m: (3,) m, corners of the box, map frame.
+            age: What a tile's evidence still weighs; all of it by default.
         Raises:
             SettingsError: the box has more voxels along an axis than can be numbered.
         """
@@ -201,7 +223,7 @@ class Region:
         found = [(x, y, z) for x, y, z in itertools.product(*axes) if (x, y, z) in tiled.tiles]
         members = [tiled.tiles[index] for index in found]
         shift = np.reshape(found, (-1, 3)).astype(np.int64) - low
-        rows = Rows.concatenate([tile.rows for tile in members])
+        rows = Rows.concatenate([decay(tile.rows, age(tile)) if age else tile.rows for tile in members])
         kernels = MapKernels.concatenate([tile.kernels for tile in members])
         of_row = np.repeat(shift, [len(tile.rows.occupied) for tile in members], axis=0)
         of_kernel = np.repeat(shift, [len(tile.kernels) for tile in members], axis=0)
@@ -216,11 +238,14 @@ class Region:
         """(3,) m, map frame."""
         return np.asarray(self.lower, np.float64) * self.grid.size_m
 
-    def tiles(self, lower_m: Float64, upper_m: Float64) -> dict[TileIndex, Tile]:
+    def tiles(
+        self, lower_m: Float64, upper_m: Float64, *, revision: int = 0, stamp_ns: int = 0
+    ) -> dict[TileIndex, Tile]:
         """The tiles that a box touches, cut out again; rows that say nothing any more are left out.
 
         Args:
             lower_m, upper_m: (3,) m, corners of a box in the region, map frame: outside it nothing was changed.
+            revision, stamp_ns: Of the new tiles.
         """
         low, high = self.grid.index_of(lower_m), self.grid.index_of(upper_m)
         rows = self.rows.take(is_alive(self.rows))
@@ -237,7 +262,9 @@ class Region:
         for number, shift in enumerate(itertools.product(*(range(s) for s in size))):
             index = (self.lower[0] + shift[0], self.lower[1] + shift[1], self.lower[2] + shift[2])
             if all(x <= i <= y for x, i, y in zip(low, index, high, strict=True)):
-                out[index] = Tile(rows.take(row_members[number]), kernels.take(kernel_members[number]))
+                out[index] = Tile(
+                    rows.take(row_members[number]), kernels.take(kernel_members[number]), revision, stamp_ns
+                )
         return out
 
 

@@ -1,8 +1,9 @@
-"""Evidence: all labelled points ever seen, as one weighted pseudo-datum a voxel and label.
+"""Evidence: all labelled points ever seen, as one weighted pseudo-datum a voxel, label and source.
 
 A row holds the weight of the samples that fell into its voxel, and their weighted sum of positions, relative to the voxel's
 centre. So it stands at their mean, rows of two maps add, and what was added can be taken off again. Hits are kept in voxels of
-half the resolution, free samples in voxels of the resolution; there are never more rows than voxels, whatever is seen.
+half the resolution, free samples in voxels of the resolution; each source, a robot, has rows of its own, so that it can be
+taken out. There are never more rows than voxels times sources, whatever is seen.
 
 All functions are pure but for `forget`, `fade` and `decay`, which scale sums in place.
 """
@@ -16,10 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potserver.numerics.threads import parallel_map, spans
-from potserver.numerics.voxel_hash import empty_table, enter, find, pack
+from potserver.numerics.voxel_hash import empty_table, find, pack
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
+Int16 = NDArray[np.int16]
 Int32 = NDArray[np.int32]
 Int64 = NDArray[np.int64]
 Bool = NDArray[np.bool_]
@@ -36,11 +38,14 @@ class Rows(NamedTuple):
     voxel: Int32  # (R, 3) cell numbers from the frame's origin, in cells of the resolution (free) or half of it (hits)
     occupied: Bool  # (R,)
     sums: Float32  # (R, 4) sum of w (x - centre) for each axis, m; sum of w
+    source: Int16  # (R,) who saw it
 
     @staticmethod
     def empty() -> Rows:
         """No rows."""
-        return Rows(np.zeros((0, 3), np.int32), np.zeros(0, bool), np.zeros((0, 4), np.float32))
+        return Rows(
+            np.zeros((0, 3), np.int32), np.zeros(0, bool), np.zeros((0, 4), np.float32), np.zeros(0, np.int16)
+        )
 
     @staticmethod
     def concatenate(sets: list[Rows]) -> Rows:
@@ -49,7 +54,7 @@ class Rows(NamedTuple):
 
     def take(self, index: NDArray[np.intp] | Bool | slice) -> Rows:
         """The rows that a numpy index picks."""
-        return Rows(self.voxel[index], self.occupied[index], self.sums[index])
+        return Rows(self.voxel[index], self.occupied[index], self.sums[index], self.source[index])
 
 
 class Added(NamedTuple):
@@ -59,27 +64,37 @@ class Added(NamedTuple):
     weight: Float32  # (R,) what each row gained
 
 
-def add(rows: Rows, points: Float64, occupied: Bool, weight: Float64 | Float32, fine_m: float) -> Added:
-    """Add weighted samples to the rows; a negative weight takes samples off, down to nothing and no further.
+def add(
+    rows: Rows,
+    points: Float64,
+    occupied: Bool,
+    weight: Float64 | Float32,
+    fine_m: float,
+    source: int = 0,
+) -> Added:
+    """Add a source's weighted samples to the rows; a negative weight takes samples off, down to nothing and no further.
 
     Args:
-        rows: Each voxel and label once.
+        rows: Each voxel, label and source once.
         points: (N, 3) m, in the rows' frame.
         occupied: (N,) labels.
         weight: (N,) of each sample.
         fine_m: The resolution.
+        source: Who saw them; rows of others stay as they are.
     """
     n_old, n = len(rows.occupied), len(points)
     voxel = np.empty((n_old + n, 3), np.int32)
     label = np.empty(n_old + n, bool)
     sums = np.zeros((n_old + n, 4), np.float32)
-    voxel[:n_old], label[:n_old], sums[:n_old] = rows
+    voxel[:n_old], label[:n_old], sums[:n_old] = rows.voxel, rows.occupied, rows.sums
+    sources = np.full(n_old + n, source, np.int16)
+    sources[:n_old] = rows.source
     gained = np.zeros(n_old + n, np.float32)
     used = _add(
-        voxel, label, sums, gained, n_old, np.ascontiguousarray(points), occupied, np.asarray(weight, np.float64),
-        fine_m, empty_table(n_old + n),
+        voxel, label, sums, sources, gained, n_old, np.ascontiguousarray(points), occupied,
+        np.asarray(weight, np.float64), fine_m, source, empty_table(n_old + n),
     )  # fmt: skip
-    return Added(Rows(voxel[:used], label[:used], sums[:used]), gained[:used])
+    return Added(Rows(voxel[:used], label[:used], sums[:used], sources[:used]), gained[:used])
 
 
 def positions(rows: Rows, fine_m: float) -> Float64:
@@ -164,7 +179,7 @@ def fade(
     if len(hits) == 0 or len(ends) == 0:
         return 0
     table = empty_table(len(hits))
-    keys = _enter_voxels(rows.voxel[hits], table)
+    keys, following = _enter_voxels(rows.voxel[hits], table)
     where = positions(rows.take(hits), fine_m).astype(np.float32)
     where[~is_alive(rows)[hits]] = np.inf  # nothing passes near a dead row
 
@@ -172,7 +187,7 @@ def fade(
 
     def run(span: tuple[int, int]) -> Int32:
         a, b = span
-        return _passes(followed[a:b], returned[a:b], origin, table, keys, where, fine_m, gap_m)
+        return _passes(followed[a:b], returned[a:b], origin, table, keys, following, where, fine_m, gap_m)
 
     passes = np.sum(parallel_map(run, spans(len(followed), _SPANS), threads), axis=0)
     passed = np.flatnonzero(passes)
@@ -190,11 +205,12 @@ def decay(rows: Rows, factor: float) -> Rows:
 
 
 @nb.njit(nogil=True, error_model="numpy", cache=True)
-def _add(voxel, label, sums, gained, n, points, occupied, weight, fine_m, table):
+def _add(voxel, label, sums, sources, gained, n, points, occupied, weight, fine_m, source, table):
     keys = np.empty(len(label), np.int64)
     for r in range(n):
-        keys[r] = pack(label[r], voxel[r, 0], voxel[r, 1], voxel[r, 2])
-    enter(table, keys, n)
+        if sources[r] == source:
+            keys[r] = pack(label[r], voxel[r, 0], voxel[r, 1], voxel[r, 2])
+            table[find(table, keys, keys[r])] = r
     cell = np.empty(3, np.int64)
     for i in range(len(points)):
         edge = 0.5 * fine_m if occupied[i] else fine_m
@@ -263,15 +279,19 @@ def _forget(sums, gained, cell, n_cells, limit):
 
 @nb.njit(nogil=True, error_model="numpy", cache=True)
 def _enter_voxels(voxel, table):
+    """Keys, and for each row the next one in the same voxel: sources have rows of their own."""
     keys = np.empty(len(voxel), np.int64)
+    following = np.empty(len(voxel), np.int64)
     for i in range(len(voxel)):
         keys[i] = pack(1, voxel[i, 0], voxel[i, 1], voxel[i, 2])
-        table[find(table, keys, keys[i])] = i
-    return keys
+        place = find(table, keys, keys[i])
+        following[i] = table[place]
+        table[place] = i
+    return keys, following
 
 
 @nb.njit(nogil=True, error_model="numpy", cache=True)
-def _passes(ends, is_return, origin, table, keys, where, fine_m, gap_m):
+def _passes(ends, is_return, origin, table, keys, following, where, fine_m, gap_m):
     """(R,) how many of the beams pass each row, each beam counted once."""
     n = np.zeros(len(keys), np.int32)
     stamp = np.full(len(keys), -1, np.int32)
@@ -299,15 +319,16 @@ def _passes(ends, is_return, origin, table, keys, where, fine_m, gap_m):
             if key == last:
                 continue
             last = key
-            r = table[find(table, keys, key)]
-            if r < 0 or stamp[r] == b:
-                continue
-            px, py, pz = where[r, 0] - origin[0], where[r, 1] - origin[1], where[r, 2] - origin[2]
-            along = px * dx + py * dy + pz * dz
-            off2 = px * px + py * py + pz * pz - along * along
-            if along < behind and off2 < 0.0625 * fine_m * fine_m:
-                n[r] += 1
-                stamp[r] = b
+            r = np.int64(table[find(table, keys, key)])
+            while r >= 0:
+                if stamp[r] != b:
+                    px, py, pz = where[r, 0] - origin[0], where[r, 1] - origin[1], where[r, 2] - origin[2]
+                    along = px * dx + py * dy + pz * dz
+                    off2 = px * px + py * py + pz * pz - along * along
+                    if along < behind and off2 < 0.0625 * fine_m * fine_m:
+                        n[r] += 1
+                        stamp[r] = b
+                r = following[r]
     return n
 
 

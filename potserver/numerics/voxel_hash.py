@@ -46,10 +46,3 @@ def find(table, keys, key):
     while table[place] >= 0 and keys[table[place]] != key:
         place = (place + 1) & mask
     return place
-
-
-@nb.njit(nogil=True, error_model="numpy", cache=True)
-def enter(table, keys, n):
-    """Put the first n keys, all different, into an empty table."""
-    for i in range(n):
-        table[find(table, keys, keys[i])] = i

@@ -1,4 +1,8 @@
-"""A scan enters the overall map: its samples become evidence, kernels are put where they are missing, and weights follow."""
+"""A scan enters the overall map: its samples become evidence, kernels are put where they are missing, and weights follow.
+
+Evidence ages where a half-life is set: a tile's rows weigh less the longer ago they were looked at, in the map's own time.
+Tiles around a scan age as it comes; of the others one part a scan, the stalest first, so that they drift back to unknown.
+"""
 
 from __future__ import annotations
 
@@ -16,6 +20,8 @@ from potserver.domain.tiles import (
     TiledMap,
     TileGrid,
     TileIndex,
+    part_of,
+    tiles_of_part,
 )
 from potserver.domain.types import Bool, Float32, Float64, KernelSet
 from potserver.errors import SolverError
@@ -33,6 +39,21 @@ _FADE_EVERY = 2  # beams of which one is followed, for what it passes through
 _TOO_WIDE = 1.5  # coarse spacings
 _EXPLAINED = 1.0  # activation by carried kernels at which the lattice adds none
 _UNSUPPORTED = 1e-5  # of a kernel's curvature: what no row within its reach leaves
+_STALE = 0.125  # half-lives after which a tile that no scan touches is fitted again
+
+
+class Moment(NamedTuple):
+    """The change that is being made: what its tiles are marked with, and what older evidence weighs by now."""
+
+    revision: int  # of the map, afterwards
+    stamp_ns: int  # map time
+    half_life_s: float = 0.0  # 0: evidence does not age
+
+    def weight_of(self, tile: Tile) -> float:
+        """What a tile's evidence still weighs."""
+        if not self.half_life_s:
+            return 1.0
+        return float(0.5 ** (max(self.stamp_ns - tile.stamp_ns, 0) / 1e9 / self.half_life_s))
 
 
 class Fused(NamedTuple):
@@ -61,6 +82,8 @@ def fuse(
     carried: KernelSet,
     settings: MappingSettings,
     *,
+    source: int,
+    moment: Moment,
     planar: bool,
     threads: int,
 ) -> Fused:
@@ -73,6 +96,8 @@ def fuse(
         origin: (3,) m, map frame.
         carried: Transported kernels, map frame; weights and variances as prior.
         settings: Of the pipeline.
+        source: The robot's number in the map.
+        moment: Of the change.
         planar: Keep kernels in the plane of the points.
         threads: Threads of the solve.
     Raises:
@@ -82,7 +107,7 @@ def fuse(
     grid = tiled.grid
     pad = grid.coarse_m
     lower, upper = labelled.points.min(axis=0) - pad, labelled.points.max(axis=0) + pad
-    region = Region.of(tiled, lower - 4 * pad, upper + 4 * pad)
+    region = Region.of(tiled, lower - 4 * pad, upper + 4 * pad, moment.weight_of)
     points = labelled.points - region.origin_m
     if settings.fade_rate:
         start = origin - region.origin_m
@@ -90,40 +115,104 @@ def fuse(
             region.rows, beams.ends + start, beams.is_return, start, fine_m=grid.fine_m,
             rate=settings.fade_rate, gap_m=settings.gap_m, every=_FADE_EVERY, threads=threads,
         )  # fmt: skip
-    new_rows = _add_evidence(region, points, labelled, settings)
-    added = _add_kernels(region, new_rows, points, carried.moved(-region.origin_m), planar, settings, threads)
-    fitted = _fit(region, lower - region.origin_m, upper - region.origin_m, settings, threads)
-    return Fused(region.tiles(lower, upper), len(added), int((added.level == CARRIED).sum()), fitted)
-
-
-def _add_evidence(
-    region: Region, points: Float64, labelled: LabelledPoints, settings: MappingSettings
-) -> evidence.Rows:
-    """Put the samples into the region's rows; the rows that are new."""
-    n_before = len(region.rows.occupied)
-    rows, gained = evidence.add(
-        region.rows, points, labelled.occupied, beam_weights(labelled), region.grid.fine_m
+    taken = KernelSet.empty()
+    if settings.carry_into_map:
+        taken = _wanted(carried.moved(-region.origin_m), region.kernels, points, grid, threads)
+    new_rows = add_evidence(
+        region, points, labelled.occupied, beam_weights(labelled), source, memory=settings.memory
     )
-    evidence.forget(rows.sums, gained, evidence.cells(rows), settings.memory)
+    added = add_kernels(region, new_rows, MapKernels.new(taken, CARRIED), planar, settings, threads)
+    fitted = _fit(region, lower - region.origin_m, upper - region.origin_m, settings, threads)
+    return Fused(
+        region.tiles(lower, upper, revision=moment.revision, stamp_ns=moment.stamp_ns),
+        len(added), int((added.level == CARRIED).sum()), fitted,
+    )  # fmt: skip
+
+
+def append(tiled: TiledMap, carried: KernelSet, moment: Moment) -> dict[TileIndex, Tile]:
+    """The tiles of a map that takes transported kernels as they are and learns nothing (the paper's POT).
+
+    Args:
+        tiled: The map; it is not changed.
+        carried: In the map frame.
+        moment: Of the change.
+    """
+    size = tiled.grid.size_m
+    tile_of = np.floor(carried.hinge_mean / size).astype(np.int64)
+    found, member = np.unique(tile_of, axis=0, return_inverse=True)
+    out = {}
+    for number, corner in enumerate(found):
+        index = (int(corner[0]), int(corner[1]), int(corner[2]))
+        new = carried.take(np.flatnonzero(member.reshape(-1) == number)).moved(-corner * size)
+        former = tiled.tiles.get(index)
+        kernels = [former.kernels] if former else []
+        out[index] = Tile(
+            evidence.Rows.empty(),
+            MapKernels.concatenate([*kernels, MapKernels.new(new, CARRIED)]),
+            moment.revision,
+            moment.stamp_ns,
+        )
+    return out
+
+
+def refit(
+    tiled: TiledMap, part: TileIndex, settings: MappingSettings, moment: Moment, *, threads: int
+) -> tuple[dict[TileIndex, Tile], bool]:
+    """Solve the weights of one part's kernels again, those around it held; its tiles, and whether the solve went well.
+
+    Raises:
+        SolverError: the solve ended without numbers.
+    """
+    grid = tiled.grid
+    corner = np.asarray(tiles_of_part(part)[0]) * grid.size_m
+    edge = (np.asarray(tiles_of_part(part)[-1]) + 1) * grid.size_m - corner
+    pad = 4 * grid.coarse_m
+    region = Region.of(tiled, corner - pad, corner + edge + pad, moment.weight_of)
+    start = corner - region.origin_m
+    fitted = _fit(region, start, start + edge, settings, threads)
+    inner = corner + 1e-3 * grid.fine_m, corner + edge - 1e-3 * grid.fine_m
+    tiles = region.tiles(*inner, revision=moment.revision, stamp_ns=moment.stamp_ns)
+    return {index: tile for index, tile in tiles.items() if index in tiled.tiles}, fitted
+
+
+def stalest_part(tiled: TiledMap, moment: Moment) -> TileIndex | None:
+    """The part with the tile that has waited longest to age; none if all are fresh enough, or nothing ages."""
+    if not moment.half_life_s or not tiled.tiles:
+        return None
+    oldest = min(tiled.tiles, key=lambda index: tiled.tiles[index].stamp_ns)
+    return part_of(oldest) if moment.weight_of(tiled.tiles[oldest]) < 0.5**_STALE else None
+
+
+def add_evidence(
+    region: Region,
+    points: Float64,
+    occupied: Bool,
+    weight: Float64 | Float32,
+    source: int,
+    *,
+    memory: float,
+) -> evidence.Rows:
+    """Put labelled samples, (N, 3) m in the region's frame, into its rows; the rows that are new."""
+    n_before = len(region.rows.occupied)
+    rows, gained = evidence.add(region.rows, points, occupied, weight, region.grid.fine_m, source)
+    evidence.forget(rows.sums, gained, evidence.cells(rows), memory)
     region.rows = rows
     return rows.take(slice(n_before, None))
 
 
-def _add_kernels(
+def add_kernels(
     region: Region,
     new_rows: evidence.Rows,
-    points: Float64,
-    carried: KernelSet,
+    taken: MapKernels,
     planar: bool,
     settings: MappingSettings,
     threads: int,
 ) -> MapKernels:
-    """Put kernels where the new rows ask for them, carried ones first; those that were added."""
+    """Put kernels where new rows ask for them, beside those that are taken as they are; all that were added."""
     grid, present = region.grid, region.kernels
     asking = evidence.positions(new_rows, grid.fine_m)
-    taken = _wanted(carried, present, points, grid, threads) if settings.carry_into_map else KernelSet.empty()
-    parts = [MapKernels.new(taken, CARRIED)]
-    from_atoms = KernelSet.concatenate([present.kernels.take(present.level == CARRIED), taken])
+    parts = [taken]
+    from_atoms = KernelSet.concatenate([present.kernels.take(present.level == CARRIED), taken.kernels])
     for level, spacing, within in ((COARSE, grid.coarse_m, _COARSE_REACH), (FINE, grid.fine_m, 0.0)):
         there = present.kernels.hinge_mean[present.level == level]
         nodes = new_nodes(

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import time
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from typing import NamedTuple
 
 import numpy as np
 
 from potserver.domain.dictionary import AtomDictionary
-from potserver.domain.kernel_map import IndexedKernels, KernelMap
-from potserver.domain.tiles import TiledMap
+from potserver.domain.kernel_map import KernelMap
+from potserver.domain.map_state import MapState
+from potserver.domain.running_scores import RunningScores
+from potserver.domain.tiles import TiledMap, TileGrid, TileIndex
 from potserver.domain.types import (
     Float64,
     KernelSet,
@@ -24,22 +27,24 @@ from potserver.domain.types import (
     TileChange,
     yaw_pose,
 )
-from potserver.errors import EmptyError
+from potserver.errors import EmptyError, SettingsError, UnknownRobotError
 from potserver.numerics import evidence
 from potserver.numerics.beams import Beams, LabelledPoints, beam_weights, label_beams, limit_range
 from potserver.numerics.geometry import in_sector, rotation_z, sector_edges, yaw_of
 from potserver.numerics.threads import default_threads, parallel_map
-from potserver.services.fusion import Fused, fuse, grid_for
+from potserver.services import map_edits
+from potserver.services.fusion import Fused, Moment, append, fuse, grid_for, refit, stalest_part
 from potserver.services.matching import Match, Matcher
 from potserver.services.refinement import Refined, refine
 from potserver.services.settings import MappingSettings
 from potserver.services.transport import Transported, transport
 
 _INSTANT_VOXEL = 2.0  # resolutions: the free points of such a voxel are one datum of the instantaneous map; hits in half of it
+_CHECK_GAP_M = 0.5  # before a beam's end, where the map is not asked whether it is free
 
 
 class MappingService:
-    """One map. `integrate` and `clear` have one caller at a time; `snapshot` may be read from any thread, and never waits.
+    """One map. What changes it has one caller at a time; `state` may be read from any thread, and never waits.
 
     `use_dictionary` may be called from any thread: the next scan sees the change, one in work does not.
     """
@@ -64,13 +69,21 @@ class MappingService:
         """
         self.map_id = map_id
         self.settings = settings or MappingSettings()
-        self.n_scans = 0
         self.atom_usage: Counter[str] = Counter()
         self._threads = threads or default_threads()
         self._seed = seed
         self.use_dictionary(dictionary if dictionary is not None else AtomDictionary.builtin())
-        self._tiled: TiledMap | None = None  # what the next scan builds on; its grid is chosen by the first
-        self.snapshot = self._map_of(KernelSet.empty(), revision=0)
+        self.state = MapState(snapshot=self._map_of(None, revision=0))
+
+    @property
+    def snapshot(self) -> KernelMap:
+        """What queries are answered from."""
+        return self.state.snapshot
+
+    @property
+    def n_scans(self) -> int:
+        """Scans in the map."""
+        return self.state.n_scans
 
     @property
     def dictionary(self) -> AtomDictionary:
@@ -85,16 +98,21 @@ class MappingService:
         }
         self._atoms = _AtomsInUse(dictionary, matchers)  # one assignment: no scan sees a half of it
 
-    def integrate(self, scan: Scan) -> MapUpdate:
+    def integrate(self, scan: Scan, *, commit: Callable[[], None] | None = None) -> MapUpdate:
         """Carry atoms to a scan and add it to the map.
 
+        Args:
+            scan: With its pose in the map.
+            commit: Called when all is computed and nothing has changed yet; if it raises, nothing will.
         Raises:
             EmptyError: no beam lies within the range limits. The map is unchanged, as after any error.
         """
         clock = _Stopwatch()
-        rng = np.random.default_rng((self._seed, self.n_scans))
+        state = self.state
+        rng = np.random.default_rng((self._seed, state.n_scans))
+        checks = np.random.default_rng((self._seed, state.n_scans, 1))
         with clock("label"):
-            beams = self._beams(scan, rng)
+            beams, checked = self._beams(scan, rng, checks)
             labelled = label_beams(
                 beams, free_per_beam=self.settings.free_per_beam, gap_m=self.settings.gap_m, rng=rng
             )
@@ -106,30 +124,34 @@ class MappingService:
             transported = self._transport(matches, sectors)
         carried = KernelSet.concatenate([t.kernels for t in transported if t is not None])
         in_map = labelled._replace(points=labelled.points + scan.origin)
+        tiled = state.tiled or TiledMap.empty(grid_for(beams, self.settings))
+        tiled, source = tiled.with_robot(scan.robot_id)
+        moment = Moment(state.map_revision + 1, max(state.stamp_ns, scan.stamp_ns), self.settings.half_life_s)
         if self.settings.refine:
-            tiled = self._tiled or TiledMap.empty(grid_for(beams, self.settings))
             prior = carried.replace(weight_var=carried.weight_var + np.float32(self.settings.borrowed_var))
             with clock("refine"):
                 instantaneous = self._refine(prior, in_map, _INSTANT_VOXEL * tiled.grid.fine_m)
             with clock("fuse"):
                 fused = fuse(
-                    tiled, in_map, beams, scan.origin, prior, self.settings, planar=scan.is_planar,
-                    threads=self._threads,
+                    tiled, in_map, beams, scan.origin, prior, self.settings, source=source, moment=moment,
+                    planar=scan.is_planar, threads=self._threads,
                 )  # fmt: skip
-            with clock("index"):
-                tiled = tiled.with_tiles(fused.tiles, self.settings.observed_activation)
-                snapshot = self._map_of(list(tiled.parts.values()), revision=self.snapshot.map_revision + 1)
         else:
-            instantaneous, fused, tiled = (
-                Refined(carried, True),
-                Fused({}, len(carried), len(carried), True),
-                None,
-            )
-            with clock("index"):
-                appended = KernelSet.concatenate([self.snapshot.kernels, carried])
-                snapshot = self._map_of(appended, revision=self.snapshot.map_revision + 1)
+            instantaneous = Refined(carried, True)
+            with clock("fuse"):
+                fused = Fused(append(tiled, carried, moment), len(carried), len(carried), True)
+        with clock("index"):
+            changed = fused.tiles
+            tiled = tiled.with_tiles(changed, self.settings.observed_activation)
+            if (stale := stalest_part(tiled, moment)) is not None:
+                aged, _ = refit(tiled, stale, self.settings, moment, threads=self._threads)
+                tiled = tiled.with_tiles(aged, self.settings.observed_activation)
+                changed = changed | aged
+            snapshot = self._map_of(tiled, revision=moment.revision, scores=state.scores)
+        with clock("check"):
+            scores = self._check(snapshot, checked, scan, state.scores, checks)
         update = MapUpdate(
-            map_revision=snapshot.map_revision,
+            map_revision=moment.revision,
             kernels=instantaneous.kernels,
             sectors=[_report(s, m, t) for s, m, t in zip(sectors, matches, transported, strict=True)],
             n_points=len(beams.ends),
@@ -138,20 +160,70 @@ class MappingService:
             map_kernels=len(snapshot),
             converged=instantaneous.converged and fused.converged,
             rule=snapshot.rule,
-            changed=self._touched(in_map.points),
+            changed=TileChange(tiled.grid.size_m, sorted(changed)),
             timings_ms=clock.timings_ms,
         )
+        if commit is not None:
+            commit()
         # nothing above changed the service, and nothing below can fail
         self.atom_usage.update(match.atom_id for match in update.sectors if match.atom_id is not None)
-        self.n_scans += 1
-        self._tiled, self.snapshot = tiled, snapshot
+        self.state = MapState(
+            snapshot=snapshot, tiled=tiled, epoch=state.epoch, n_scans=state.n_scans + 1, stamp_ns=moment.stamp_ns,
+            scores=scores,
+        )  # fmt: skip
         return update
 
-    def clear(self) -> None:
+    def clear(self) -> TileChange:
         """Forget all scans; the revision and the use of atoms go on counting, so that readers notice."""
-        self.snapshot = self._map_of(KernelSet.empty(), revision=self.snapshot.map_revision + 1)
-        self._tiled = None
-        self.n_scans = 0
+        return self._swap(MapState(snapshot=self._map_of(None, revision=self.state.map_revision + 1)))
+
+    def restore(self, state: MapState) -> TileChange:
+        """Take a state that was saved in place of the present one, with all its numbers.
+
+        Raises:
+            SettingsError: it was made with another `tile_size_m`.
+        """
+        size = self.settings.tile_size_m
+        if state.tiled is not None and state.tiled.grid.size_m != size:
+            raise SettingsError(
+                f"the saved map has tiles of {state.tiled.grid.size_m} m, mapping.tile_size_m is {size}: set it to the map's"
+            )
+        snapshot = self._map_of(state.tiled, revision=state.map_revision, scores=state.scores)
+        return self._swap(dataclasses.replace(state, snapshot=snapshot))
+
+    def merge(self, other: MapState, T_map_other: Float64) -> TileChange:
+        """Take in another map of the same place, see `map_edits.merge`.
+
+        Raises:
+            BadPoseError: the transform is not rigid. The map is unchanged, as after any error.
+        """
+        if other.tiled is None:
+            return TileChange(self.settings.tile_size_m, [])
+        state = self.state
+        moment = Moment(
+            state.map_revision + 1, max(state.stamp_ns, other.stamp_ns), self.settings.half_life_s
+        )
+        ours = state.tiled or TiledMap.empty(TileGrid.of(self.settings.tile_size_m, other.tiled.grid.fine_m))
+        tiled, changed = map_edits.merge(
+            ours, other.tiled, T_map_other, self.settings, moment, threads=self._threads
+        )
+        return self._edited(tiled, changed, moment, n_scans=state.n_scans + other.n_scans)
+
+    def remove_robot(self, robot_id: str) -> TileChange:
+        """Take out what one robot has seen, see `map_edits.remove_robot`.
+
+        Raises:
+            UnknownRobotError: the map has nothing from this robot. The map is unchanged, as after any error.
+            UnsupportedError: the map keeps no evidence.
+        """
+        state = self.state
+        moment = Moment(state.map_revision + 1, state.stamp_ns, self.settings.half_life_s)
+        if state.tiled is None:
+            raise UnknownRobotError(f"the map is empty: it has nothing from {robot_id!r}")
+        tiled, changed = map_edits.remove_robot(
+            state.tiled, robot_id, self.settings, moment, threads=self._threads
+        )
+        return self._edited(tiled, changed, moment, n_scans=state.n_scans)
 
     def warm_up(self) -> None:
         """Compile or load the numerics on small synthetic scans, in a map of its own."""
@@ -168,18 +240,42 @@ class MappingService:
 
     # --- the steps, in order ---------------------------------------------------------------------------------------------
 
-    def _beams(self, scan: Scan, rng: np.random.Generator) -> Beams:
-        """The scan's beams, limited in range and number."""
+    def _beams(
+        self, scan: Scan, rng: np.random.Generator, checks: np.random.Generator
+    ) -> tuple[Beams, Beams]:
+        """The scan's beams, limited in range and number: those to learn from, and those that are only asked about."""
         beams = limit_range(scan.beams, self.settings.min_range_m, self.settings.max_range_m)
         n = len(beams.ends)
         if n == 0:
             raise EmptyError(
                 f"none of {len(scan.points)} beams is longer than {self.settings.min_range_m} m: nothing to learn from"
             )
+        drawn = np.arange(n)
         if n > self.settings.beams_per_scan:
             drawn = np.sort(rng.choice(n, self.settings.beams_per_scan, replace=False))
-            beams = Beams(beams.ends[drawn], beams.is_return[drawn])
-        return beams
+        is_checked = checks.random(len(drawn)) < self.settings.check_share
+        is_checked[0] &= not is_checked.all()  # something must be learned
+        learned, checked = drawn[~is_checked], drawn[is_checked]
+        return (
+            Beams(beams.ends[learned], beams.is_return[learned]),
+            Beams(beams.ends[checked], beams.is_return[checked]),
+        )
+
+    def _check(
+        self,
+        snapshot: KernelMap,
+        checked: Beams,
+        scan: Scan,
+        scores: RunningScores,
+        rng: np.random.Generator,
+    ) -> RunningScores:
+        """Ask the map about beams that it did not learn: their ends, and one point of each that they crossed."""
+        asked = label_beams(checked, free_per_beam=1, gap_m=_CHECK_GAP_M, rng=rng)
+        answer = snapshot.occupancy(asked.points + scan.origin)
+        latent_mean = np.where(answer.observed, answer.latent_mean, np.float32(0))
+        return scores.with_points(
+            latent_mean, answer.latent_var, asked.occupied, snapshot.rule.mean_moderation
+        )
 
     def _draw(self, labelled: LabelledPoints, n_beams: int, rng: np.random.Generator) -> LabelledPoints:
         """The points of the beams that transport and the instantaneous map are made from."""
@@ -239,20 +335,33 @@ class MappingService:
             tolerance=s.instant_tolerance, threads=self._threads, sample_weight=rows.sums[:, 3],
         )  # fmt: skip
 
-    def _touched(self, points: Float64) -> TileChange:
-        size = self.settings.tile_size_m
-        tile = np.floor(points / size).astype(np.int64)
-        low = tile.min(axis=0)
-        extent = tile.max(axis=0) - low + 1
-        number = np.ravel_multi_index(tuple((tile - low).T), tuple(extent))
-        tiles = np.stack(np.unravel_index(np.flatnonzero(np.bincount(number)), tuple(extent)), axis=1) + low
-        return TileChange(size, [(int(x), int(y), int(z)) for x, y, z in tiles])
+    def _edited(
+        self, tiled: TiledMap, changed: Iterable[TileIndex], moment: Moment, *, n_scans: int
+    ) -> TileChange:
+        state = self.state
+        snapshot = self._map_of(tiled, revision=moment.revision, scores=state.scores)
+        self.state = dataclasses.replace(
+            state, snapshot=snapshot, tiled=tiled, n_scans=n_scans, stamp_ns=moment.stamp_ns
+        )
+        return TileChange(tiled.grid.size_m, sorted(changed))
 
-    def _map_of(self, kernels: KernelSet | Sequence[IndexedKernels], *, revision: int) -> KernelMap:
+    def _swap(self, state: MapState) -> TileChange:
+        """Put another map in the place of this one; all tiles of both have changed."""
+        tiles = {index for s in (self.state, state) if s.tiled is not None for index in s.tiled.tiles}
+        self.state = state
+        return TileChange(self.settings.tile_size_m, sorted(tiles))
+
+    def _map_of(
+        self, tiled: TiledMap | None, *, revision: int, scores: RunningScores | None = None
+    ) -> KernelMap:
         s = self.settings
+        moderation = s.mean_moderation
+        if s.calibrate and scores is not None:
+            moderation = scores.moderation(moderation)
         return KernelMap(
-            kernels, observed_activation=s.observed_activation, prior_var=s.prior_var, residual_var=s.residual_var,
-            mean_moderation=s.mean_moderation, map_revision=revision, threads=self._threads,
+            list(tiled.parts.values()) if tiled is not None else [], observed_activation=s.observed_activation,
+            prior_var=s.prior_var, residual_var=s.residual_var, mean_moderation=moderation, map_revision=revision,
+            threads=self._threads,
         )  # fmt: skip
 
 

@@ -84,6 +84,9 @@ class MappingSettings:
     saturation: float = 20.0  # looks at one place that count; further ones repeat them
     memory: float = 200.0  # looks that one place keeps; older ones give way
     fade_rate: float = 0.05  # by which hits weaken with each beam that passes through them; 0: never
+    half_life_s: float = (
+        0.0  # in which evidence that nobody renews loses half its weight, by the scans' stamps; 0: never
+    )
     max_kernels_per_tile: int = 8_000
     carry_into_map: bool = False  # transported kernels join the overall map too, with their weights as prior
 
@@ -93,6 +96,8 @@ class MappingSettings:
     mean_moderation: float = (
         0.05  # share of the latent variance that pulls means towards 0.5, see KernelMap; 1 is the paper's
     )
+    check_share: float = 0.02  # of the beams, that are never learned but asked: the map's own running scores
+    calibrate: bool = True  # choose mean_moderation by those scores, once there are enough of them
     tile_size_m: float = 10.0  # the map's unit of storage and of change notices
 
     def __post_init__(self) -> None:
@@ -101,6 +106,8 @@ class MappingSettings:
             "gap_m",
             "fine_m",
             "fade_rate",
+            "half_life_s",
+            "check_share",
             "borrowed_var",
             "residual_var",
             "mean_moderation",
@@ -118,6 +125,7 @@ class MappingSettings:
         self._need("rotations_deg", len(self.rotations_deg) > 0, "at least one angle")
         self._need("max_range_m", self.max_range_m > self.min_range_m, "above min_range_m")
         self._need("feature_cut", self.feature_cut < 1, "below 1")
+        self._need("check_share", self.check_share <= 0.5, "at most 0.5")
         for field in dataclasses.fields(self):
             value = getattr(self, field.name)
             self._need(field.name, not (isinstance(value, float) and not math.isfinite(value)), "finite")
@@ -173,6 +181,8 @@ PAPER = MappingSettings(
     refine=False,
     residual_var=0.0,
     mean_moderation=1.0,
+    check_share=0.0,
+    calibrate=False,
 )
 
 PROFILES = {"default": MappingSettings(), "paper": PAPER}

@@ -225,10 +225,12 @@ class FakeMapper:
         self.failure: Exception | None = None
         self.mapping, self.queries, self.warming = Gate(), Gate(), Gate()
 
-    def integrate(self, scan: Scan) -> MapUpdate:
+    def integrate(self, scan: Scan, *, commit: Callable[[], None] | None = None) -> MapUpdate:
         self.mapping.pass_through()
         if self.failure is not None:
             raise self.failure
+        if commit is not None:
+            commit()
         self.scans.append(scan)
         points = (scan.points @ scan.T_map_sensor[:3, :3].T + scan.T_map_sensor[:3, 3])[::5]
         k = len(points)
@@ -261,9 +263,11 @@ class FakeMapper:
     def use_dictionary(self, dictionary: AtomDictionary) -> None:
         self.dictionary = dictionary
 
-    def clear(self) -> None:
+    def clear(self) -> TileChange:
+        tiles = np.unique(np.floor(self.snapshot.kernels.hinge_mean / 10.0).astype(int), axis=0)
         self.snapshot = FakeSnapshot(self, KernelSet.empty(), self.snapshot.map_revision + 1)
         self.n_scans = 0
+        return TileChange(10.0, [(int(x), int(y), int(z)) for x, y, z in tiles])
 
     def warm_up(self) -> None:
         self.warming.pass_through()

@@ -51,8 +51,8 @@ def _service(dictionary: AtomDictionary | None = NO_ATOMS, *, threads: int = 2, 
 
 
 def _tiled(service: MappingService) -> TiledMap:
-    assert service._tiled is not None
-    return service._tiled
+    assert service.state.tiled is not None
+    return service.state.tiled
 
 
 def _same(one: KernelSet, other: KernelSet) -> None:
@@ -190,7 +190,7 @@ def test_a_solve_that_fails_leaves_no_trace(fails: str, monkeypatch: pytest.Monk
         patched.setattr(fusion, "warm_fit", fail)
         with pytest.raises(MemoryError if fails == "raise" else SolverError):
             service.integrate(_scan(1))
-    assert service._tiled is tiled
+    assert service.state.tiled is tiled
     assert service.snapshot is snapshot
     for index, tile in tiled.tiles.items():
         np.testing.assert_array_equal(tile.rows.sums, sums[index])

@@ -11,6 +11,7 @@ from potclient.kernels import KernelSet as ClientKernels
 from potserver.adapters import codec
 from potserver.domain.dictionary import AtomDictionary
 from potserver.domain.kernel_map import KernelMap
+from potserver.domain.map_state import MapState
 from potserver.domain.types import KernelSet
 from potserver.errors import BadPointsError
 from potserver.services.mapping import MappingService
@@ -129,7 +130,7 @@ def test_an_empty_map_is_flat() -> None:
 
 def test_the_service_gives_them_on_request() -> None:
     mapping = MappingService(AtomDictionary(()), threads=1)
-    mapping.snapshot = scene()
+    mapping.state = MapState(snapshot=scene())
     service = QueryService(mapping)
     assert service.occupancy([[0.0, 0, 0]]).gradient is None
     assert service.occupancy([[0.0, 0]], with_gradient=True).gradient.shape == (1, 3)

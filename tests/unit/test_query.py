@@ -9,6 +9,7 @@ import pytest
 
 from potserver.domain.dictionary import AtomDictionary
 from potserver.domain.kernel_map import KernelMap
+from potserver.domain.map_state import MapState
 from potserver.domain.types import KernelSet
 from potserver.errors import BadPointsError, OutOfRangeError, ShapeError, TooLargeError
 from potserver.services.mapping import MappingService
@@ -30,7 +31,7 @@ def _kernels(k: int = 300, seed: int = 0) -> KernelSet:
 @pytest.fixture
 def mapping() -> MappingService:
     service = MappingService(AtomDictionary(()), threads=1)
-    service.snapshot = KernelMap(_kernels(), map_revision=7, threads=1)
+    service.state = MapState(snapshot=KernelMap(_kernels(), map_revision=7, threads=1))
     return service
 
 
@@ -84,7 +85,7 @@ def test_grid_parts_are_the_cells_in_order(query: QueryService, mapping: Mapping
 def test_all_parts_come_from_one_snapshot(query: QueryService, mapping: MappingService) -> None:
     plan = query.grid([-1, -1, -1], [1, 1, 1], 0.5, part_cells=30)
     first = plan.part(0)[1]
-    mapping.snapshot = KernelMap(_kernels(seed=9), map_revision=8)
+    mapping.state = MapState(snapshot=KernelMap(_kernels(seed=9), map_revision=8))
     again, last = plan.part(0)[1], plan.part(plan.n_parts - 1)[1]
     np.testing.assert_array_equal(first.mean, again.mean)
     assert first.map_revision == last.map_revision == 7
@@ -150,7 +151,7 @@ def test_params_with_a_bad_corner(query: QueryService, corner: list) -> None:
 
 
 def test_an_empty_map_answers(mapping: MappingService, query: QueryService) -> None:
-    mapping.snapshot = KernelMap(KernelSet.empty(), map_revision=1)
+    mapping.state = MapState(snapshot=KernelMap(KernelSet.empty(), map_revision=1))
     assert not query.occupancy([[0.0, 0, 0]]).observed.any()
     assert not query.grid([0, 0, 0], [1, 1, 1], 0.5).part(0)[1].observed.any()
     parts, revision = query.params()

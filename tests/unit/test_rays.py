@@ -11,6 +11,7 @@ import pytest
 from potclient.towns import open_town
 from potserver.domain.dictionary import AtomDictionary
 from potserver.domain.kernel_map import KernelMap
+from potserver.domain.map_state import MapState
 from potserver.domain.types import KernelSet, RayReturns, Scan, Unknown
 from potserver.errors import BadPointsError, OutOfRangeError, ShapeError, TooLargeError
 from potserver.numerics import gradients, lattice, rays
@@ -23,7 +24,7 @@ Array = np.ndarray[Any, Any]
 
 def service_of(kernels: KernelMap, **limits: Any) -> QueryService:
     mapping = MappingService(AtomDictionary(()), threads=1)
-    mapping.snapshot = kernels
+    mapping.state = MapState(snapshot=kernels)
     return QueryService(mapping, **limits)
 
 

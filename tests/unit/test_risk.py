@@ -11,6 +11,7 @@ import pytest
 
 from potserver.domain.dictionary import AtomDictionary
 from potserver.domain.kernel_map import KernelMap
+from potserver.domain.map_state import MapState
 from potserver.domain.types import KernelSet, PathRisk, Unknown
 from potserver.errors import BadPointsError, BadPoseError, OutOfRangeError, ShapeError, TooLargeError
 from potserver.numerics.lattice import covered_cells, most_cells
@@ -23,7 +24,7 @@ CUT = 1e-4  # by so little a probability may depend on what is asked together: t
 
 def service_of(kernels: KernelMap, **limits: Any) -> QueryService:
     mapping = MappingService(AtomDictionary(()), threads=1)
-    mapping.snapshot = kernels
+    mapping.state = MapState(snapshot=kernels)
     return QueryService(mapping, **limits)
 
 
