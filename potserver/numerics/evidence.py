@@ -27,6 +27,7 @@ Int64 = NDArray[np.int64]
 Bool = NDArray[np.bool_]
 
 _LEAST_WEIGHT = 1e-3  # a row with less says nothing
+_INSIDE = 0.5 - 1e-6  # voxels, from the centre
 _MAX_PASSES = 5.0  # that one scan may hold against a row
 _WALK = 0.75  # step of a walk along a beam, in voxels of hits
 _SPANS = 8  # of beams; fixed, like all spans of work, though these only count
@@ -98,10 +99,14 @@ def add(
 
 
 def positions(rows: Rows, fine_m: float) -> Float64:
-    """(R, 3) m: where the rows stand, the weighted means of their samples."""
+    """(R, 3) m: where the rows stand, the weighted means of their samples, strictly inside their voxels.
+
+    Samples on a face, as those of a planar map at z = 0, would else be in one voxel and their mean by rounding in the next.
+    """
     edge = np.where(rows.occupied, 0.5 * fine_m, fine_m)[:, None]
     weight = np.maximum(rows.sums[:, 3:], np.float32(1e-9))
-    return np.asarray((rows.voxel + 0.5) * edge + rows.sums[:, :3] / weight, np.float64)
+    offset = np.clip(rows.sums[:, :3] / weight, -_INSIDE * edge, _INSIDE * edge)
+    return np.asarray((rows.voxel + 0.5) * edge + offset, np.float64)
 
 
 def is_alive(rows: Rows) -> Bool:

@@ -16,7 +16,6 @@ from potserver.services.fusion import Moment, add_evidence, add_kernels, refit
 from potserver.services.settings import MappingSettings
 
 _SWEEPS = 3  # over the parts, each solved with those around it held
-_ROUNDING = 6  # decimals of a metre
 _NEWTON_STEPS = 6  # of each solve at least: nobody waits for it as for a scan
 
 
@@ -58,13 +57,12 @@ def merge(
         corners = np.asarray(inside) * size
         origin = corners[0]
         rows = [evidence.decay(theirs.tiles[i].rows, moment.weight_of(theirs.tiles[i])) for i in inside]
-        # means at the edge of a voxel, as in planar maps, must not leave it by the rounding of their sums
         where = np.concatenate(
             [
                 evidence.positions(r, theirs.grid.fine_m) + c
                 for r, c in zip(rows, corners - origin, strict=True)
             ]
-        ).round(_ROUNDING)
+        )
         data = evidence.Rows.concatenate(rows)
         kernels = MapKernels.concatenate(
             [theirs.tiles[i].kernels.moved(c) for i, c in zip(inside, corners - origin, strict=True)]

@@ -84,7 +84,9 @@ def test_two_robots_maps_merge_into_what_one_server_would_hold(planar: bool) -> 
     change = one.merge(yours, np.eye(4))
     other.merge(mine, np.eye(4))
     assert one.snapshot.map_revision == revision + 1
-    assert set(change.tiles) <= set(one.state.tiled.tiles)
+    changed = {i for i, tile in one.state.tiled.tiles.items() if tile.revision == revision + 1}
+    assert changed
+    assert changed <= set(change.tiles)
     assert one.n_scans == 8
     assert set(one.state.tiled.robots) == {"a", "b"}
     truth = both.snapshot.occupancy(points)
