@@ -217,6 +217,9 @@ class MapServer:
             latencies=self.health.latencies(),
             rss_bytes=rss_bytes(),
             map_kernels={node.map_id: len(node.mapper.snapshot) for node in nodes},
+            map_scores={
+                node.map_id: (node.mapper.scores, node.mapper.snapshot.rule.mean_moderation) for node in nodes
+            },
         )
 
     def _teardown(self, drain_timeout_s: float) -> bool:

@@ -824,8 +824,19 @@ def _event_line(kind: str, message: Any) -> str:
         why = f" ({message.reason})" if message.reason else ""
         return f"{message.robot} #{message.seq} {message.status.value}{why}, {message.integrate_ms:.0f} ms"
     depths = ", ".join(f"{name} {value}" for name, value in sorted(message.queues.items()))
-    kernels = ", ".join(f"{name} {value} kernels" for name, value in sorted(message.map_kernels.items()))
+    scores = message.map_scores or {}
+    kernels = ", ".join(
+        f"{name} {value} kernels{_running_scores(scores.get(name))}"
+        for name, value in sorted(message.map_kernels.items())
+    )
     return f"{message.server} {message.state}: {kernels}; {depths}; {message.rss_bytes / 2**20:.0f} MiB"
+
+
+def _running_scores(scores: messages.MapScores | None) -> str:
+    """What the map says of itself, on beams that it never learned; nothing before the first of them."""
+    if scores is None or not scores.n_points:
+        return ""
+    return f" (own NLL {scores.nll:.3f}, ECE {scores.ece:.3f})"
 
 
 # --- load ----------------------------------------------------------------------------------------------------------

@@ -18,6 +18,7 @@ from potschemas import keys, messages, wire
 from potschemas.messages import DType, ErrorCode
 from potserver.adapters.limits import Limits
 from potserver.adapters.ports import Snapshot
+from potserver.domain.running_scores import RunningScores
 from potserver.domain.types import (
     AnswerRule,
     Atom,
@@ -811,8 +812,9 @@ def encode_stats(
     latencies: Mapping[str, Latency],
     rss_bytes: int,
     map_kernels: dict[str, int],
+    map_scores: Mapping[str, tuple[RunningScores, float]],
 ) -> Wire:
-    """The server's counters."""
+    """The server's counters; the scores of each map with the mean moderation that it answers with."""
     return _wire(
         messages.Stats(
             server=server_id,
@@ -833,6 +835,16 @@ def encode_stats(
             },
             rss_bytes=rss_bytes,
             map_kernels=map_kernels,
+            map_scores={
+                map_id: messages.MapScores(
+                    n_points=scores.n_points,
+                    nll=scores.mean_nll(moderation),
+                    brier=scores.mean_brier,
+                    ece=scores.ece,
+                    mean_moderation=moderation,
+                )
+                for map_id, (scores, moderation) in map_scores.items()
+            },
         )
     )
 

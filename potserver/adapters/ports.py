@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potserver.domain.dictionary import AtomDictionary
+from potserver.domain.running_scores import RunningScores
 from potserver.domain.types import (
     AnswerRule,
     KernelSet,
@@ -53,6 +54,8 @@ class Mapper(Protocol):
     def snapshot(self) -> Snapshot: ...
     @property
     def n_scans(self) -> int: ...
+    @property
+    def scores(self) -> RunningScores: ...
     @property
     def atom_usage(self) -> Mapping[str, int]: ...
     @property

@@ -81,6 +81,11 @@ class MappingService:
         return self.state.snapshot
 
     @property
+    def scores(self) -> RunningScores:
+        """How well the map answers about beams that it never learned."""
+        return self.state.scores
+
+    @property
     def n_scans(self) -> int:
         """Scans in the map."""
         return self.state.n_scans

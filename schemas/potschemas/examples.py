@@ -318,6 +318,9 @@ def examples() -> dict[str, m.Message]:
             },
             rss_bytes=700_000_000,
             map_kernels={"default": 5120},
+            map_scores={
+                "default": m.MapScores(n_points=812.5, nll=0.05, brier=0.01, ece=0.008, mean_moderation=0.025)
+            },
         )
     )
     unmeasured = m.LatencySummary(count=0, p50_ms=math.nan, p95_ms=math.nan, p99_ms=math.nan, max_ms=math.nan)

@@ -475,6 +475,16 @@ class LatencySummary(msgspec.Struct, frozen=True, kw_only=True):
     max_ms: Measured  # ms
 
 
+class MapScores(msgspec.Struct, frozen=True, kw_only=True):
+    """How well a map answers about beams that it set aside and never learned, older ones counting less."""
+
+    n_points: Finite  # what the points asked about count together; each beam gives its end and a point that it crossed
+    nll: Measured  # nats a point; not finite before the first
+    brier: Measured  # mean squared error of the probability
+    ece: Measured  # expected calibration error, 15 bins
+    mean_moderation: Finite  # with which the map answers now, chosen by these points
+
+
 class Stats(Message, frozen=True, kw_only=True):
     """Counters since start, and what the server is doing now: `srv/<server>/stats`, once a second."""
 
@@ -489,6 +499,7 @@ class Stats(Message, frozen=True, kw_only=True):
     latencies: dict[str, LatencySummary]  # e.g. integrate, points, grid
     rss_bytes: Count  # resident memory of the process
     map_kernels: dict[str, Count]  # kernels per map
+    map_scores: dict[str, MapScores] | Absent = ABSENT  # running scores per map
 
 
 # --- control --------------------------------------------------------------------------------------

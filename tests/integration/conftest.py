@@ -19,6 +19,7 @@ from potschemas import messages, wire
 from potschemas.keys import MapKeys, stats_key
 from potserver.config import Settings, load_settings
 from potserver.domain.dictionary import AtomDictionary
+from potserver.domain.running_scores import RunningScores
 from potserver.domain.types import AnswerRule, KernelSet, MapUpdate, Occupancy, Scan, TileChange
 from potserver.server import MapServer
 from potserver.services.query import QueryService
@@ -220,6 +221,7 @@ class FakeMapper:
         self.dictionary = AtomDictionary(())
         self.atom_usage: collections.Counter[str] = collections.Counter()
         self.n_scans = 0
+        self.scores = RunningScores()
         self.snapshot = FakeSnapshot(self, KernelSet.empty(), 0)
         self.scans: list[Scan] = []
         self.failure: Exception | None = None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import collections
 import json
+import math
 import queue
 import signal
 import subprocess
@@ -23,10 +24,11 @@ from potschemas.keys import stats_key
 from potschemas.messages import ErrorCode, ReceiptStatus
 from potserver.adapters.intake import Barrier
 from potserver.config import load_settings
+from potserver.domain.running_scores import RunningScores
 from potserver.errors import EmptyError, SettingsError
 from potserver.server import MapServer
 
-from .conftest import DEADLINE_S, ROOT, Client, make_cloud, points_query, until
+from .conftest import DEADLINE_S, ROOT, Client, FakeSnapshot, make_cloud, points_query, until
 
 HERE = points_query([[0.0, 0, 0]])
 MakeRig = Callable[..., Any]
@@ -230,6 +232,23 @@ def test_integrate_is_refused_at_once_when_the_queue_is_full(make_rig: MakeRig) 
     rig.mapper.mapping.release()
     assert (first().seq, second().seq) == (0, 1)
     assert client.stats().counters["queries.integrate.overloaded"] == 1
+
+
+def test_stats_publish_how_well_each_map_answers(make_rig: MakeRig) -> None:
+    rig = make_rig()
+    client = rig.client()
+    before = (client.stats().map_scores or {})["default"]
+    assert before.n_points == 0
+    assert math.isnan(before.nll)
+    asked = np.full(50, 2.0, np.float32)
+    rig.mapper.scores = RunningScores().with_points(asked, np.zeros(50, np.float32), np.ones(50, bool), 1.0)
+    after = (client.stats().map_scores or {})["default"]
+    p = 1.0 / (1.0 + math.exp(-2.0))
+    assert after.n_points == 50
+    assert after.nll == pytest.approx(-math.log(p))
+    assert after.brier == pytest.approx((1 - p) ** 2)
+    assert after.ece == pytest.approx(1 - p)
+    assert after.mean_moderation == FakeSnapshot.rule.mean_moderation
 
 
 def test_queries_never_wait_for_a_scan(make_rig: MakeRig) -> None:
