@@ -139,7 +139,7 @@ class KernelSet:
 
     def take(self, index: NDArray[np.intp] | Bool | slice) -> KernelSet:
         """The kernels that a numpy index picks."""
-        return KernelSet(**{f.name: getattr(self, f.name)[index] for f in dataclasses.fields(self)})
+        return KernelSet._checked({name: getattr(self, name)[index] for name in _KERNEL_ARRAYS})
 
     def replace(self, **arrays: NDArray[np.floating]) -> KernelSet:
         """A copy with some arrays exchanged."""
@@ -154,12 +154,18 @@ class KernelSet:
         """One set of all kernels, in order; no sets give the empty set."""
         if not sets:
             return KernelSet.empty()
-        return KernelSet(
-            **{
-                f.name: np.concatenate([getattr(s, f.name) for s in sets])
-                for f in dataclasses.fields(KernelSet)
-            }
+        return KernelSet._checked(
+            {name: np.concatenate([getattr(s, name) for s in sets]) for name in _KERNEL_ARRAYS}
         )
+
+    @staticmethod
+    def _checked(arrays: dict[str, NDArray[np.floating]]) -> KernelSet:
+        """A set of rows of sets that were checked before: cutting tiles makes hundreds of them a scan."""
+        new = object.__new__(KernelSet)
+        for name, array in arrays.items():
+            array.flags.writeable = False
+            object.__setattr__(new, name, array)
+        return new
 
     @staticmethod
     def empty() -> KernelSet:
@@ -173,6 +179,9 @@ class KernelSet:
             weight_mean=z,
             weight_var=z,
         )
+
+
+_KERNEL_ARRAYS = tuple(field.name for field in dataclasses.fields(KernelSet))
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False, kw_only=True)

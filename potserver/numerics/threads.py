@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from functools import cache
 from typing import TypeVar
 
@@ -35,6 +35,19 @@ def parallel_map(function: Callable[[T], R], items: Iterable[T], threads: int, l
     if threads <= 1 or len(work) <= 1:
         return [function(item) for item in work]
     return list(_pool(threads, lane).map(function, work))
+
+
+def parallel_pair(first: Callable[[], T], second: Callable[[], R], threads: int) -> tuple[T, R]:
+    """Both results; at the same time if there are two threads or more. An error of either is raised, the first's before."""
+    if threads <= 1:
+        return first(), second()
+    # a lane of its own: both may use `parallel_map` inside
+    other = _pool(threads, "pair").submit(second)
+    try:
+        mine = first()
+    finally:
+        wait([other])  # nothing goes on behind the caller's back
+    return mine, other.result()
 
 
 def spans(n: int, parts: int) -> list[tuple[int, int]]:

@@ -31,7 +31,7 @@ from potserver.errors import EmptyError, SettingsError, UnknownRobotError
 from potserver.numerics import evidence
 from potserver.numerics.beams import Beams, LabelledPoints, beam_weights, label_beams, limit_range
 from potserver.numerics.geometry import in_sector, rotation_z, sector_edges, yaw_of
-from potserver.numerics.threads import default_threads, parallel_map
+from potserver.numerics.threads import default_threads, parallel_map, parallel_pair
 from potserver.services import map_edits
 from potserver.services.fusion import Fused, Moment, append, fuse, grid_for, refit, stalest_part
 from potserver.services.matching import Match, Matcher
@@ -71,6 +71,9 @@ class MappingService:
         self.settings = settings or MappingSettings()
         self.atom_usage: Counter[str] = Counter()
         self._threads = threads or default_threads()
+        # where neither needs the other, what is carried from atoms and the overall map are worked out at the same time
+        self._side_by_side = self.settings.refine and not self.settings.carry_into_map
+        self._threads_each = max(1, self._threads // 2) if self._side_by_side else self._threads
         self._seed = seed
         self.use_dictionary(dictionary if dictionary is not None else AtomDictionary.builtin())
         self.state = MapState(snapshot=self._map_of(None, revision=0))
@@ -98,7 +101,9 @@ class MappingService:
     def use_dictionary(self, dictionary: AtomDictionary) -> None:
         """Match against other atoms from the next scan on; the map keeps what it has."""
         matchers = {
-            dims: Matcher(dictionary.of_dims(dims), self.settings, threads=self._threads, seed=self._seed)
+            dims: Matcher(
+                dictionary.of_dims(dims), self.settings, threads=self._threads_each, seed=self._seed
+            )
             for dims in (2, 3)
         }
         self._atoms = _AtomsInUse(dictionary, matchers)  # one assignment: no scan sees a half of it
@@ -123,27 +128,42 @@ class MappingService:
             )
             drawn = self._draw(labelled, len(beams.ends), rng)
             sectors = self._cut_sectors(drawn, scan)
-        with clock("match"):
-            matches = self._atoms.matchers[2 if scan.is_planar else 3].match(sectors)
-        with clock("transport"):
-            transported = self._transport(matches, sectors)
-        carried = KernelSet.concatenate([t.kernels for t in transported if t is not None])
         in_map = labelled._replace(points=labelled.points + scan.origin)
         tiled = state.tiled or TiledMap.empty(grid_for(beams, self.settings))
         tiled, source = tiled.with_robot(scan.robot_id)
         moment = Moment(state.map_revision + 1, max(state.stamp_ns, scan.stamp_ns), self.settings.half_life_s)
-        if self.settings.refine:
+
+        def from_atoms() -> _FromAtoms:
+            with clock("match"):
+                matches = self._atoms.matchers[2 if scan.is_planar else 3].match(sectors)
+            with clock("transport"):
+                transported = self._transport(matches, sectors)
+            carried = KernelSet.concatenate([t.kernels for t in transported if t is not None])
+            reports = [_report(s, m, t) for s, m, t in zip(sectors, matches, transported, strict=True)]
+            if not self.settings.refine:
+                return _FromAtoms(reports, carried, Refined(carried, True))
             prior = carried.replace(weight_var=carried.weight_var + np.float32(self.settings.borrowed_var))
             with clock("refine"):
-                instantaneous = self._refine(prior, in_map, _INSTANT_VOXEL * tiled.grid.fine_m)
+                refined = self._refine(prior, in_map, _INSTANT_VOXEL * tiled.grid.fine_m)
+            return _FromAtoms(reports, prior, refined)
+
+        def from_evidence(carried: KernelSet) -> Fused:
             with clock("fuse"):
-                fused = fuse(
-                    tiled, in_map, beams, scan.origin, prior, self.settings, source=source, moment=moment,
-                    planar=scan.is_planar, threads=self._threads,
+                return fuse(
+                    tiled, in_map, beams, scan.origin, carried, self.settings, source=source, moment=moment,
+                    planar=scan.is_planar, threads=self._threads_each,
                 )  # fmt: skip
+
+        if self._side_by_side:
+            instantaneous, fused = parallel_pair(
+                from_atoms, lambda: from_evidence(KernelSet.empty()), self._threads
+            )
         else:
-            instantaneous = Refined(carried, True)
-            with clock("fuse"):
+            instantaneous = from_atoms()
+            carried = instantaneous.carried
+            if self.settings.refine:
+                fused = from_evidence(carried)
+            else:
                 fused = Fused(append(tiled, carried, moment), len(carried), len(carried), True)
         with clock("index"):
             changed = fused.tiles
@@ -157,13 +177,13 @@ class MappingService:
             scores = self._check(snapshot, checked, scan, state.scores, checks)
         update = MapUpdate(
             map_revision=moment.revision,
-            kernels=instantaneous.kernels,
-            sectors=[_report(s, m, t) for s, m, t in zip(sectors, matches, transported, strict=True)],
+            kernels=instantaneous.refined.kernels,
+            sectors=instantaneous.sectors,
             n_points=len(beams.ends),
             n_kernels_added=fused.n_added,
             n_kernels_transported=fused.n_transported,
             map_kernels=len(snapshot),
-            converged=instantaneous.converged and fused.converged,
+            converged=instantaneous.refined.converged and fused.converged,
             rule=snapshot.rule,
             changed=TileChange(tiled.grid.size_m, sorted(changed)),
             timings_ms=clock.timings_ms,
@@ -322,7 +342,7 @@ class MappingService:
             match = matches[i]
             return None if match is None else transport(match, sectors[i], self.settings, seed=self._seed + i)
 
-        return parallel_map(run, range(len(sectors)), self._threads)
+        return parallel_map(run, range(len(sectors)), self._threads_each)
 
     def _refine(self, kernels: KernelSet, labelled: LabelledPoints, voxel_m: float) -> Refined:
         """The instantaneous map: transported weights as prior, the scan's points as data, those of one voxel as one."""
@@ -337,7 +357,7 @@ class MappingService:
         )
         return refine(
             kernels, evidence.positions(rows, voxel_m) + corner, rows.occupied, feature_cut=s.feature_cut,
-            tolerance=s.instant_tolerance, threads=self._threads, sample_weight=rows.sums[:, 3],
+            tolerance=s.instant_tolerance, threads=self._threads_each, sample_weight=rows.sums[:, 3],
         )  # fmt: skip
 
     def _edited(
@@ -368,6 +388,14 @@ class MappingService:
             prior_var=s.prior_var, residual_var=s.residual_var, mean_moderation=moderation, map_revision=revision,
             threads=self._threads,
         )  # fmt: skip
+
+
+class _FromAtoms(NamedTuple):
+    """What transport made of a scan."""
+
+    sectors: list[SectorMatch]
+    carried: KernelSet  # map frame, as prior
+    refined: Refined  # the instantaneous map
 
 
 class _AtomsInUse(NamedTuple):
