@@ -300,6 +300,7 @@ def _fit(region: Region, lower: Float64, upper: Float64, settings: MappingSettin
         kernels.gamma[local],
         edge_m=grid.coarse_m,
         cut=settings.feature_cut,
+        bytes_a_value=1,
         threads=threads,
     )
     per_step = blocks.n_values * (2 + 2 * settings.gradient_steps)
