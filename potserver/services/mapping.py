@@ -40,6 +40,7 @@ from potserver.services.settings import MappingSettings
 from potserver.services.transport import Transported, transport
 
 _INSTANT_VOXEL = 2.0  # resolutions: the free points of such a voxel are one datum of the instantaneous map; hits in half of it
+_CUBE = 2.5  # of those voxels, in which their rows are solved together
 _CHECK_GAP_M = 0.5  # before a beam's end, where the map is not asked whether it is free
 
 
@@ -356,8 +357,9 @@ class MappingService:
             voxel_m,
         )
         return refine(
-            kernels, evidence.positions(rows, voxel_m) + corner, rows.occupied, feature_cut=s.feature_cut,
-            tolerance=s.instant_tolerance, threads=self._threads_each, sample_weight=rows.sums[:, 3],
+            kernels, evidence.positions(rows, voxel_m) + corner, rows.occupied, edge_m=_CUBE * voxel_m,
+            feature_cut=s.feature_cut, newton_steps=s.instant_newton_steps, gradient_steps=s.instant_gradient_steps,
+            threads=self._threads_each, sample_weight=rows.sums[:, 3],
         )  # fmt: skip
 
     def _edited(

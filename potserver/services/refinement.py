@@ -11,9 +11,10 @@ import numpy as np
 
 from potserver.domain.types import Bool, Float32, Float64, KernelSet
 from potserver.errors import SolverError
+from potserver.numerics.feature_blocks import feature_blocks
 from potserver.numerics.geometry import voxel_pick
-from potserver.numerics.kernel_index import build_index, latent_sums, sparse_features
-from potserver.numerics.logistic import fit_sparse
+from potserver.numerics.kernel_index import build_index, latent_sums
+from potserver.numerics.warm_fit import warm_fit
 
 _GAMMA_SHAPE = 100.0  # a placed kernel's width is known to 10 %
 
@@ -59,7 +60,7 @@ def activation(kernels: KernelSet, points: Float64, *, threads: int) -> np.ndarr
 
 
 class Refined(NamedTuple):
-    """Kernels with refined weights, and whether the solve reached its tolerance; if not, they are the best found."""
+    """Kernels with refined weights, and whether the solve went well; if not, they are the best found."""
 
     kernels: KernelSet
     converged: bool
@@ -70,37 +71,41 @@ def refine(
     points: Float64,
     occupied: Bool,
     *,
+    edge_m: float,
     feature_cut: float,
-    tolerance: float,
+    newton_steps: int,
+    gradient_steps: int,
     threads: int,
     sample_weight: Float32 | None = None,
 ) -> Refined:
     """Solve all weights of `kernels` jointly on labelled points; their present mean and variance are the prior.
 
+    The solve starts from weights of 0: transported ones are the prior, but as a start they are far off where the scenes differ.
+
     Args:
         kernels: In the frame of the points.
         points: (N, 3) m.
         occupied: (N,) their labels.
+        edge_m: Of the cubes that points are solved in; some twenty points to a cube are good.
         feature_cut: Activations below this are left out of the solve.
-        tolerance: Of the gradient, relative to its start.
+        newton_steps, gradient_steps: Newton steps, and conjugate-gradient steps for each.
         threads: Threads of the solve.
         sample_weight: (N,) how much each point counts; 1 by default.
     Raises:
         SolverError: the solve ended without numbers.
     """
-    features = sparse_features(
-        points,
-        kernels.hinge_mean,
-        kernels.gamma,
-        cut=feature_cut,
-        threads=threads,
-    )
-    posterior = fit_sparse(
-        features, occupied, kernels.weight_mean, kernels.weight_var,
-        sample_weight=sample_weight, tolerance=tolerance, threads=threads,
+    corner = points.min(axis=0) if len(points) else np.zeros(3)
+    blocks = feature_blocks(
+        points - corner, kernels.hinge_mean - corner, kernels.gamma, edge_m=edge_m, cut=feature_cut,
+        bytes_a_value=1, threads=threads,
     )  # fmt: skip
-    if not (np.isfinite(posterior.mean).all() and np.isfinite(posterior.var).all()):
+    counts = np.ones(len(points), np.float32) if sample_weight is None else sample_weight
+    fit = warm_fit(
+        blocks, occupied, counts, kernels.weight_mean, kernels.weight_var, np.zeros_like(kernels.weight_mean),
+        n_newton=newton_steps, n_conjugate_gradient=gradient_steps, threads=threads,
+    )  # fmt: skip
+    if not (np.isfinite(fit.weights).all() and np.isfinite(fit.var).all()):
         raise SolverError(
             f"the weights of {len(kernels)} kernels on {len(points)} points came out NaN or infinite"
         )
-    return Refined(kernels.replace(weight_mean=posterior.mean, weight_var=posterior.var), posterior.converged)
+    return Refined(kernels.replace(weight_mean=fit.weights, weight_var=fit.var), fit.converged)

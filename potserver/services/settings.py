@@ -72,7 +72,8 @@ class MappingSettings:
         25.0  # log-odds^2, added to the variance of transported weights: borrowed is not seen
     )
     feature_cut: float = 0.02  # activations below this are left out of the solves
-    instant_tolerance: float = 0.1  # of the gradient, at which the instantaneous map's solve stops
+    instant_newton_steps: int = 4  # of the instantaneous map's solve
+    instant_gradient_steps: int = 8  # conjugate-gradient steps for each of them
 
     # overall map
     fine_m: float = 0.0  # resolution; 0: a 25th of the first scan's median range, between 0.2 and 0.4
@@ -118,7 +119,8 @@ class MappingSettings:
         for name in (
             "max_range_m", "free_per_beam", "beams_per_scan", "n_sectors", "rank_hits", "rank_free", "rank_reg_m2",
             "rank_tolerance", "rank_iterations", "couple_points", "couple_reg", "couple_tolerance", "couple_iterations",
-            "prior_var", "feature_cut", "instant_tolerance", "observed_activation", "tile_size_m", "match_beams",
+            "prior_var", "feature_cut", "instant_newton_steps", "instant_gradient_steps",
+            "observed_activation", "tile_size_m", "match_beams",
             "newton_steps", "gradient_steps", "cheap_values", "saturation", "memory", "max_kernels_per_tile",
         ):  # fmt: skip
             self._need(name, getattr(self, name) > 0, "positive")

@@ -9,7 +9,7 @@ from potserver.domain.kernel_map import KernelMap
 from potserver.domain.types import KernelSet
 from potserver.errors import SolverError
 from potserver.numerics.beams import LabelledPoints
-from potserver.numerics.logistic import WeightPosterior
+from potserver.numerics.warm_fit import WarmFit
 from potserver.services.refinement import (
     activation,
     gamma_of_spacing,
@@ -33,10 +33,12 @@ def _placed(labelled: LabelledPoints) -> KernelSet:
     return KernelSet.concatenate([place_kernels(labelled.points, 1.0, 50.0), place_kernels(hits, 0.3, 50.0)])
 
 
-def _refine(kernels: KernelSet, labelled: LabelledPoints, tolerance: float = 1e-4) -> KernelSet:
-    return refine(
-        kernels, labelled.points, labelled.occupied, feature_cut=0.01, tolerance=tolerance, threads=1
-    ).kernels
+OPTIONS = {"edge_m": 1.0, "feature_cut": 0.01, "newton_steps": 12, "gradient_steps": 40}
+
+
+def _refine(kernels: KernelSet, labelled: LabelledPoints, **changes: int) -> KernelSet:
+    options = {**OPTIONS, "threads": 1, **changes}
+    return refine(kernels, labelled.points, labelled.occupied, **options).kernels
 
 
 @pytest.mark.parametrize("offset", [0.0, -7.3, 4e6])
@@ -116,11 +118,15 @@ def test_a_point_of_weight_two_is_two_points() -> None:
     labelled = _labelled()
     placed = _placed(labelled)
     twice = np.concatenate([labelled.points, labelled.points]), np.concatenate([labelled.occupied] * 2)
-    options = {"feature_cut": 0.01, "tolerance": 1e-4, "threads": 1}
     one = refine(
-        placed, labelled.points, labelled.occupied, sample_weight=np.full(600, 2.0, np.float32), **options
+        placed,
+        labelled.points,
+        labelled.occupied,
+        sample_weight=np.full(600, 2.0, np.float32),
+        threads=1,
+        **OPTIONS,
     ).kernels
-    other = refine(placed, *twice, **options).kernels
+    other = refine(placed, *twice, threads=1, **OPTIONS).kernels
     np.testing.assert_allclose(one.weight_mean, other.weight_mean, atol=0.02)
 
 
@@ -132,19 +138,14 @@ def test_weights_that_are_not_numbers_are_refused(monkeypatch: pytest.MonkeyPatc
     labelled = _labelled()
     placed = _placed(labelled)
     nan = np.full(len(placed), np.nan, np.float32)
-    bad = WeightPosterior(nan, nan, 1, 1, 1.0, False)
-    monkeypatch.setattr("potserver.services.refinement.fit_sparse", lambda *_, **__: bad)
+    bad = WarmFit(nan, nan, nan, 0.0, 0.0, 1, False)
+    monkeypatch.setattr("potserver.services.refinement.warm_fit", lambda *_, **__: bad)
     with pytest.raises(SolverError, match="NaN"):
-        refine(placed, labelled.points, labelled.occupied, feature_cut=0.01, tolerance=0.1, threads=1)
+        _refine(placed, labelled)
 
 
 def test_the_weights_do_not_depend_on_the_number_of_threads() -> None:
     labelled = _labelled()
     placed = _placed(labelled)
-    one, three = (
-        refine(
-            placed, labelled.points, labelled.occupied, feature_cut=0.01, tolerance=0.03, threads=n
-        ).kernels
-        for n in (1, 3)
-    )
+    one, three = (_refine(placed, labelled, newton_steps=3, threads=n) for n in (1, 3))
     np.testing.assert_array_equal(one.weight_mean, three.weight_mean)
