@@ -18,6 +18,7 @@ from potserver.domain.kernel_map import IndexedKernels
 from potserver.domain.types import Bool, Float32, Float64, KernelSet
 from potserver.errors import SettingsError, ShapeError
 from potserver.numerics.evidence import Rows, decay, is_alive
+from potserver.numerics.threads import parallel_map
 from potserver.numerics.voxel_hash import CELL_LIMIT
 
 TileIndex = tuple[int, int, int]  # floor(p_map / tile_size_m)
@@ -156,7 +157,9 @@ class TiledMap(NamedTuple):
             return self, self.robots.index(robot_id)
         return self._replace(robots=(*self.robots, robot_id)), len(self.robots)
 
-    def with_tiles(self, changed: Mapping[TileIndex, Tile], observed_activation: float) -> TiledMap:
+    def with_tiles(
+        self, changed: Mapping[TileIndex, Tile], observed_activation: float, *, threads: int = 1
+    ) -> TiledMap:
         """The map with some tiles exchanged, or gone if they are empty; only the parts that they lie in are indexed again."""
         tiles = dict(self.tiles)
         for index, tile in changed.items():
@@ -164,16 +167,23 @@ class TiledMap(NamedTuple):
                 tiles.pop(index, None)
             else:
                 tiles[index] = tile
-        parts = dict(self.parts)
-        for number in dict.fromkeys(part_of(index) for index in changed):
+
+        def indexed(number: TileIndex) -> IndexedKernels | None:
             found = [index for index in tiles_of_part(number) if index in tiles]
+            if not found:
+                return None
             members = [tiles[index].kernels.kernels for index in found]
             shift = np.repeat(np.reshape(found, (-1, 3)), [len(m) for m in members], axis=0)
-            if not members:
-                parts.pop(number, None)
-                continue
             kernels = KernelSet.concatenate(members).moved(np.asarray(shift * self.grid.size_m, np.float64))
-            parts[number] = IndexedKernels.of(kernels, observed_activation)
+            return IndexedKernels.of(kernels, observed_activation)
+
+        touched = list(dict.fromkeys(part_of(index) for index in changed))
+        parts = dict(self.parts)
+        for number, part in zip(touched, parallel_map(indexed, touched, threads), strict=True):
+            if part is None:
+                parts.pop(number, None)
+            else:
+                parts[number] = part
         return self._replace(tiles=tiles, parts=parts)
 
 

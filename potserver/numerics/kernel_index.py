@@ -35,6 +35,7 @@ _FRINGE = 25.0  # gamma d^2 out to which samples lie
 _STACK = 4.0  # kernels within a width of each other that are nothing special
 _TARGET_QUERIES_PER_CUBE = 24
 _PART_CUBE_M = 10.0  # a third of the edge within which points ask together
+_WORTH_THREADS = 4096  # points below which one thread is as fast as several
 
 
 class KernelIndex(NamedTuple):
@@ -193,7 +194,8 @@ def latent_sums(index: KernelIndex, points: Float64, *, threads: int = 1, lane: 
             index.level_cell, index.level_size, index.keys, sums,
         )  # fmt: skip
 
-    parallel_map(run, spans(len(cuts) - 1, 16 * threads if threads > 1 else 1), threads, lane)
+    threads = threads if n >= _WORTH_THREADS else 1
+    parallel_map(run, spans(len(cuts) - 1, 4 * threads if threads > 1 else 1), threads, lane)
     out[:, order] = sums
     return LatentSums(*out)
 
@@ -225,16 +227,23 @@ def latent_sums_of_parts(
     if len(points) == 0 or not parts.indices:
         return total
     order, cuts, groups = sort_into_cubes(points, _PART_CUBE_M)
-    for a, b in itertools.pairwise(cuts[groups]):
-        members = order[a:b]
-        x = points[members]
-        reached = (parts.lower <= x.max(axis=0)).all(axis=1) & (parts.upper >= x.min(axis=0)).all(axis=1)
-        for number in np.flatnonzero(reached):
-            inside = ((x >= parts.lower[number]) & (x <= parts.upper[number])).all(axis=1)
-            if inside.any():
-                sums = latent_sums(parts.indices[number], x[inside], threads=threads, lane=lane)
-                for out, part in zip(total, sums, strict=True):
-                    out[members[inside]] += part
+    pieces = list(itertools.pairwise(cuts[groups].tolist()))
+
+    def run(span: tuple[int, int]) -> None:
+        for a, b in pieces[slice(*span)]:
+            members = order[a:b]
+            x = points[members]
+            reached = (parts.lower <= x.max(axis=0)).all(axis=1) & (parts.upper >= x.min(axis=0)).all(axis=1)
+            for number in np.flatnonzero(reached):
+                inside = ((x >= parts.lower[number]) & (x <= parts.upper[number])).all(axis=1)
+                if inside.any():
+                    sums = latent_sums(parts.indices[number], x[inside])
+                    for out, part in zip(total, sums, strict=True):
+                        out[members[inside]] += part
+
+    # whole pieces to a thread: to share the points of each would cost more than it gains
+    threads = threads if len(points) >= _WORTH_THREADS else 1
+    parallel_map(run, spans(len(pieces), 4 * threads if threads > 1 else 1), threads, lane)
     return total
 
 

@@ -41,6 +41,7 @@ from potserver.services.transport import Transported, transport
 
 _INSTANT_VOXEL = 2.0  # resolutions: the free points of such a voxel are one datum of the instantaneous map; hits in half of it
 _CUBE = 2.5  # of those voxels, in which their rows are solved together
+_MOST_CHECKED = 100  # beams a scan, about
 _CHECK_GAP_M = 0.5  # before a beam's end, where the map is not asked whether it is free
 
 
@@ -152,7 +153,7 @@ class MappingService:
             with clock("fuse"):
                 return fuse(
                     tiled, in_map, beams, scan.origin, carried, self.settings, source=source, moment=moment,
-                    planar=scan.is_planar, threads=self._threads_each,
+                    planar=scan.is_planar, threads=self._threads,
                 )  # fmt: skip
 
         if self._side_by_side:
@@ -168,7 +169,7 @@ class MappingService:
                 fused = Fused(append(tiled, carried, moment), len(carried), len(carried), True)
         with clock("index"):
             changed = fused.tiles
-            tiled = tiled.with_tiles(changed, self.settings.observed_activation)
+            tiled = tiled.with_tiles(changed, self.settings.observed_activation, threads=self._threads)
             if (stale := stalest_part(tiled, moment)) is not None:
                 aged, _ = refit(tiled, stale, self.settings, moment, threads=self._threads)
                 tiled = tiled.with_tiles(aged, self.settings.observed_activation)
@@ -279,7 +280,7 @@ class MappingService:
         drawn = np.arange(n)
         if n > self.settings.beams_per_scan:
             drawn = np.sort(rng.choice(n, self.settings.beams_per_scan, replace=False))
-        is_checked = checks.random(len(drawn)) < self.settings.check_share
+        is_checked = checks.random(len(drawn)) < min(self.settings.check_share, _MOST_CHECKED / len(drawn))
         is_checked[0] &= not is_checked.all()  # something must be learned
         learned, checked = drawn[~is_checked], drawn[is_checked]
         return (
