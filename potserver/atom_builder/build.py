@@ -8,8 +8,6 @@ import functools
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-import numpy as np
-
 from potclient.errors import DatasetError
 from potserver.atom_builder.engines import Engine
 from potserver.atom_builder.recipe import Recipe, located, open_recording
@@ -153,7 +151,7 @@ def _choose(
     ]
     cover = greedy_cover(
         atoms,
-        np.array([candidate.scores.nll for _, candidate in pool]),
+        [candidate.content_nats for _, candidate in pool],
         tolerances,
         max_atoms=recipe.max_atoms,
         group=[index for index, _ in pool],

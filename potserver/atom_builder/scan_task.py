@@ -52,6 +52,7 @@ class Candidate(NamedTuple):
     atom: Atom
     scores: Metrics  # on the held-out beams of its own sector
     later: Metrics | None  # on later scans' held-out beams; None where none saw the sector again
+    content_nats: float  # what it tells about the held-out beams of its own sector, see `content_nats`
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -117,7 +118,8 @@ def _learn_scan(task: ScanTask, on_epoch: Callable[[Progress], None] | None) -> 
     for atom in atoms:
         where = SectorOf(recorded, int(atom.provenance["sector"]), task.settings)
         kernels = _means_alone(atom.kernels.hinge_mean, atom.kernels.gamma, atom.kernels.weight_mean)
-        own = _judge(kernels, where, [labels for _, labels in parts])
+        held_out = [labels for _, labels in parts]
+        own = _judge(kernels, where, held_out)
         reason = _refusal(own, task.quality)
         if own is None or reason is not None:
             refused[atom.atom_id] = reason or NOT_JUDGED
@@ -127,8 +129,10 @@ def _learn_scan(task: ScanTask, on_epoch: Callable[[Progress], None] | None) -> 
         noted = _written("held_out", own) | {"later_scans": str(len(seen_again) if then else 0)}
         if then is not None:
             noted |= _written("later", then)
+        content = content_nats(own, np.concatenate([where.pick(labels)[1] for labels in held_out]))
+        noted |= {"content_nats": f"{content:.0f}"}
         noted_atom = dataclasses.replace(atom, provenance=atom.provenance | noted)
-        candidates.append(Candidate(noted_atom, own, then))
+        candidates.append(Candidate(noted_atom, own, then, content))
     return ScanResult(task=task, candidates=candidates, refused=refused, n_without_hits=n_without_hits)
 
 
@@ -195,6 +199,18 @@ def _judge(kernels: KernelMap, where: SectorOf, held_out: list[LabelledPoints]) 
         return None
     answer = kernels.occupancy(np.concatenate([part[0] for part in parts]))
     return score(answer.mean, occupied, answer.observed)
+
+
+def content_nats(scores: Metrics, occupied: NDArray[np.bool_]) -> float:
+    """What kernels tell about held-out points: how much likelier these are than by the share of occupied ones among them, nats.
+
+    Args:
+        scores: Of the kernels on these points.
+        occupied: (N,) the truth, both labels present.
+    """
+    share = float(occupied.mean())
+    constant = -(share * np.log(share) + (1.0 - share) * np.log1p(-share))
+    return float(scores.n * (constant - scores.nll))
 
 
 def _refusal(scores: Metrics | None, quality: Quality) -> str | None:

@@ -19,8 +19,9 @@ Sampling in the first stage too was measured: the means then end near their star
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import numba as nb
@@ -30,17 +31,26 @@ from numpy.typing import NDArray
 
 from potserver.errors import EmptyError, ShapeError, SolverError
 from potserver.numerics.fastexp import FAST, exp32
-from potserver.numerics.kernel_index import sparse_features
-from potserver.numerics.logistic import WeightPosterior, fit_sparse, rows_dot
-from potserver.numerics.threads import parallel_map, spans
+from potserver.numerics.feature_blocks import feature_blocks, gradient_and_diagonal, product
+from potserver.numerics.occupancy import sigmoid
+from potserver.numerics.threads import parallel_map
+from potserver.numerics.warm_fit import WarmFit, warm_fit
 
 Bool = NDArray[np.bool_]
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 
-_BLOCKS = 4  # fixed: the sums, and so the kernels, must not depend on the number of threads
 _FEATURE_CUT = 3e-3  # activations below this are left out of an epoch
-_NEGLIGIBLE = np.float32(1e-4)  # points explained to this residual have no say in a gradient
+_EDGE_IN_LENGTHS = 1.0  # of the cubes that share a list of kernels
+_NEGLIGIBLE = 1e-4  # points explained to this residual have no say in a gradient; for the smaller of 1 and the mean count
+_NEWTON_STEPS, _GRADIENT_STEPS = (
+    2,
+    12,
+)  # of the weights between epochs: Newton's, and conjugate gradients in each
+_LEAST_CURVATURE = 1e-5  # of a point, for those steps
+_COOLING, _COOLINGS = 0.4, 2  # an epoch without a gain makes steps smaller; so many times, then it is the end
+_DISPERSION_RATE = 0.1  # of Adam, in log standard deviations and log shapes
+_LEAST_GAMMA = 1e-20  # a sample of a wide Gamma may underflow
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -52,10 +62,13 @@ class AbhmSettings:
     gamma_shape: float = 2.0  # of gamma's prior, whose mean is the start
     max_epochs: int = 10  # of the means
     dispersion_epochs: int = 4
-    steps: int = 60  # gradient steps an epoch
+    dispersion_steps: int = 30  # gradient steps of the dispersions an epoch
+    steps: int = 60  # gradient steps of the means an epoch
     batch: int = 2_000  # points a step
     learning_rate: float = 0.1  # of hinges (in length scales) and of log gamma; falls along a half cosine
-    tolerance: float = 2e-3  # two epochs that each gain less than this share of the objective end the means; negative = never
+    # an epoch that gains less than this share of the objective makes the steps smaller, the third one ends the means;
+    # negative = never
+    tolerance: float = 2e-3
 
     def __post_init__(self) -> None:
         for name in ("weight_var", "hinge_reach", "gamma_shape", "learning_rate"):
@@ -64,8 +77,9 @@ class AbhmSettings:
         for name in ("max_epochs", "dispersion_epochs"):
             if getattr(self, name) < 0:
                 raise ShapeError(f"{name} must be >= 0, got {getattr(self, name)}")
-        if self.steps < 1 or self.batch < 1:
-            raise ShapeError("steps and batch must be at least 1")
+        for name in ("steps", "dispersion_steps", "batch"):
+            if getattr(self, name) < 1:
+                raise ShapeError(f"{name} must be at least 1, got {getattr(self, name)}")
 
 
 class AbhmEpoch(NamedTuple):
@@ -122,11 +136,13 @@ def fit_abhm(
         threads: For the products with the features; the result does not depend on it.
         on_epoch: Called after each epoch of the means, e.g. to score held-out points and move a progress bar.
     Raises:
-        EmptyError: no points or no kernels. ShapeError: arrays disagree, or gamma is not positive.
+        EmptyError: no points or no kernels. ShapeError: arrays disagree, gamma is not positive, or the seed is negative.
         SolverError: the objective is no longer finite.
     """
     n = len(points)
     _check(points, occupied, hinge, gamma, sample_weight)
+    if seed < 0:
+        raise ShapeError(f"seed must be >= 0, got {seed}")
     count = np.ones(n, np.float32) if sample_weight is None else sample_weight.astype(np.float32)
     free_axes = (np.ptp(points, axis=0) > 0.0).astype(np.float32)
     problem = _Problem(points, occupied, count, settings, threads)
@@ -134,7 +150,7 @@ def fit_abhm(
     rng = np.random.default_rng(seed)
 
     means = _learn_means(problem, start, rng, on_epoch)
-    hinge_sd, shape, elbos = _learn_dispersions(problem, start, means, rng, seed)
+    hinge_sd, shape, elbos = _learn_dispersions(problem, start, means, rng)
     return AbhmPosterior(
         weight_mean=means.weights.mean,
         weight_var=means.weights.var,
@@ -191,16 +207,22 @@ class _Start:
         return float(moved + shape * (np.exp(ratio) - ratio - 1.0).sum())
 
 
+class _Weights(NamedTuple):
+    mean: Float32  # (K,) log-odds
+    var: Float32  # (K,) log-odds^2
+    converged: bool
+
+
 class _Means(NamedTuple):
     hinge: Float64
     gamma: Float64
-    weights: WeightPosterior
+    weights: _Weights
     objectives: list[float]
     converged: bool
 
 
 class _Problem:
-    """The labelled points, sorted so that those near each other share kernels; rebuilt features an epoch."""
+    """The labelled points in cubes, each with the kernels that reach it; cut anew in every epoch."""
 
     def __init__(
         self, points: Float64, occupied: Bool, count: Float32, settings: AbhmSettings, threads: int
@@ -208,49 +230,83 @@ class _Problem:
         self.points, self.occupied, self.count = points, occupied, count
         self.settings, self.threads = settings, threads
         self.n = len(points)
+        self.n_batches = max(1, round(self.n / settings.batch))
+        self.corner = points.min(axis=0)  # relative to it float32 has the digits that matter
+        self.negligible = np.float32(_NEGLIGIBLE * min(1.0, float(count.mean(dtype=np.float64))))
 
     def gather(self, hinge: Float64, gamma: Float64) -> None:
-        """Find which kernels reach which points."""
-        self.features = sparse_features(self.points, hinge, gamma, cut=_FEATURE_CUT, threads=self.threads)
-        order = self.features.order
-        # relative to one corner: float32 then has the digits that matter
-        self.corner = self.points.min(axis=0)
-        self.sorted_points = (self.points[order] - self.corner).astype(np.float32)
+        """Find which kernels reach which cubes."""
+        edge_m = _EDGE_IN_LENGTHS * float(np.median(1.0 / np.sqrt(2.0 * gamma)))
+        relative = self.points - self.corner
+        self.blocks = feature_blocks(
+            relative, hinge - self.corner, gamma, edge_m=edge_m, cut=_FEATURE_CUT, threads=self.threads
+        )
+        order = self.blocks.order
+        self.x = np.ascontiguousarray(relative[order].T, np.float32)
         self.sorted_occupied, self.sorted_count = self.occupied[order], self.count[order]
 
-    def solve(self, n_kernels: int, start: Float32 | None, *, rough: bool) -> WeightPosterior:
-        """The weights given the features; roughly where gradient steps follow."""
-        return fit_sparse(
-            self.features, self.occupied,
-            np.zeros(n_kernels, np.float32), np.full(n_kernels, self.settings.weight_var, np.float32),
-            sample_weight=self.count, start=start,
-            tolerance=3e-2 if rough else 1e-3, max_newton=2 if rough else 30,
-            max_conjugate_gradient=20 if rough else 200, threads=self.threads,
+    def improve(self, weight: Float32, *, n_newton: int, n_conjugate_gradient: int) -> WarmFit:
+        """Better weights given the features, from where they are."""
+        return warm_fit(
+            self.blocks, self.occupied, self.count, np.zeros_like(weight),
+            np.full(len(weight), self.settings.weight_var, np.float32), weight, n_newton=n_newton,
+            n_conjugate_gradient=n_conjugate_gradient, least_curvature=_LEAST_CURVATURE, threads=self.threads,
         )  # fmt: skip
 
-    def batches(self, rng: np.random.Generator) -> NDArray[np.int64]:
-        """(B,) rows for one step; in order, for the cache's sake."""
-        size = self.settings.batch
-        return np.arange(self.n) if size >= self.n else np.sort(rng.choice(self.n, size, replace=False))
+    def solve(self, weight: Float32) -> _Weights:
+        """The best weights given the features, and their variances."""
+        solved = self.improve(weight, n_newton=50, n_conjugate_gradient=200)
+        p = sigmoid(product(self.blocks, solved.weights, threads=self.threads))
+        _, diagonal = gradient_and_diagonal(
+            self.blocks, np.zeros_like(p), self.sorted_count * p * (1.0 - p), threads=self.threads
+        )
+        var = 1.0 / (diagonal + np.float32(1.0 / self.settings.weight_var))
+        return _Weights(solved.weights, var, solved.converged and solved.n_newton < 50)
+
+    def batches(self, rng: np.random.Generator) -> Iterator[NDArray[np.int64]]:
+        """Endless passes over the points: of each cube a step sees every `n_batches`-th one, in turn."""
+        n_cubes = sum(len(part.cuts) - 1 for part in self.blocks.parts)
+        while True:
+            first = rng.integers(self.n_batches, size=n_cubes)
+            for turn in range(self.n_batches):
+                yield (first + turn) % self.n_batches
 
     def log_likelihood(
-        self, hinge: Float32, gamma: Float32, weight: Float32, rows: NDArray[np.int64]
+        self, hinge: Float32, gamma: Float32, weight: Float32, first: NDArray[np.int64]
     ) -> tuple[float, Float32, Float32, Float32]:
-        """Sum over rows, and its gradients; hinges relative to the corner."""
+        """Sum over the points of a batch times the number of batches, and its gradients; hinges relative to the corner."""
+        kernels = np.concatenate([hinge.T, gamma[None], weight[None]])
+        starts = np.cumsum([0, *(len(part.cuts) - 1 for part in self.blocks.parts)])
         parts = parallel_map(
-            lambda span: _rows_gradient(
-                self.sorted_points, self.sorted_occupied, self.sorted_count, rows[span[0] : span[1]],
-                self.features.indptr, self.features.indices, hinge, gamma, weight,
+            lambda i: _gradient(
+                self.x, self.sorted_occupied, self.sorted_count, self.blocks.parts[i].cuts,
+                self.blocks.parts[i].kernels, self.blocks.parts[i].numbers, kernels,
+                first[starts[i] : starts[i + 1]], self.n_batches, self.negligible,
             ),
-            spans(len(rows), _BLOCKS), self.threads,
+            range(len(self.blocks.parts)), self.threads,
         )  # fmt: skip
-        total, d_hinge, d_gamma, d_weight = parts[0]
-        for part in parts[1:]:
-            total += part[0]
-            d_hinge += part[1]
-            d_gamma += part[2]
-            d_weight += part[3]
-        return total, d_hinge, d_gamma, d_weight
+        total = sum(part[0] for part in parts) * self.n_batches
+        gradient = np.sum([part[1] for part in parts], axis=0, dtype=np.float32) * np.float32(self.n_batches)
+        return total, np.ascontiguousarray(gradient[:3].T), gradient[3], gradient[4]
+
+    def curvatures(self, hinge: Float32, gamma: Float32, weight: Float32) -> tuple[Float32, Float32]:
+        """Gauss-Newton curvature of the log-likelihood in hinges (K, 3), 1/m^2, and in log gammas (K,)."""
+        columns = np.concatenate([hinge.T, gamma[None], weight[None]])
+        total = np.sum(
+            [
+                _curvatures(self.x, self.sorted_count, part.cuts, part.kernels, part.numbers, columns)
+                for part in self.blocks.parts
+            ],
+            axis=0, dtype=np.float32,
+        )  # fmt: skip
+        return np.ascontiguousarray(total[:3].T), total[3]
+
+    def objective(self, weight: Float32) -> float:
+        """Minus the log posterior of the weights, constants left out, nats."""
+        f = product(self.blocks, weight, threads=self.threads)
+        loss = np.logaddexp(0.0, f, dtype=np.float64) - self.sorted_occupied * f
+        prior = np.square(weight, dtype=np.float64).sum() / (2.0 * self.settings.weight_var)
+        return float((self.sorted_count * loss).sum() + prior)
 
 
 def _learn_means(
@@ -260,95 +316,93 @@ def _learn_means(
     on_epoch: Callable[[AbhmEpoch], None] | None,
 ) -> _Means:
     settings, k, n = start.settings, len(start.hinge), problem.n
-    shift = torch.zeros((k, 3), requires_grad=True)  # of hinges, in length scales
-    log_ratio = torch.zeros(k, requires_grad=True)  # of gammas to their start
-    weight = torch.zeros(k, requires_grad=True)
-    optimiser = torch.optim.Adam([shift, log_ratio, weight], lr=settings.learning_rate)
-    free_axes = torch.from_numpy(start.free_axes)
-    length, gamma_start = _tensor(start.length), _tensor(start.gamma)
+    shift = np.zeros((k, 3), np.float32)  # of hinges, in length scales
+    log_ratio = np.zeros(k, np.float32)  # of gammas to their start
+    weight = np.zeros(k, np.float32)
+    optimiser = _Adam([shift, log_ratio, weight])
+    length, gamma_start = start.length.astype(np.float32)[:, None], start.gamma.astype(np.float32)
     total = settings.max_epochs * settings.steps
     objectives: list[float] = []
-    n_still, taken = 0, 0
-    warm: Float32 | None = None
+    best, n_coolings, taken = math.inf, 0, 0
     for epoch in range(settings.max_epochs + 1):
-        hinge, gamma = start.hinge_at(shift.detach().numpy()), start.gamma_at(log_ratio.detach().numpy())
+        hinge, gamma = start.hinge_at(shift), start.gamma_at(log_ratio)
         if not (np.isfinite(hinge).all() and np.isfinite(gamma).all() and (gamma > 0).all()):
             raise SolverError(f"learning {k} kernels on {n} points diverged in epoch {epoch}")
         problem.gather(hinge, gamma)
-        last = epoch == settings.max_epochs or n_still == 2
-        weights = problem.solve(k, warm, rough=not last)
-        objective = _objective(problem, weights.mean) + start.penalty(
-            shift.detach().numpy(), log_ratio.detach().numpy()
-        )
+        weight[:] = problem.improve(
+            weight, n_newton=_NEWTON_STEPS, n_conjugate_gradient=_GRADIENT_STEPS
+        ).weights
+        objective = problem.objective(weight) + start.penalty(shift, log_ratio)
+        n_coolings += epoch > 0 and best - objective < settings.tolerance * best
+        best = min(best, objective)
+        last = epoch == settings.max_epochs or n_coolings > _COOLINGS
+        if last:
+            weights = problem.solve(weight)
+            objective = problem.objective(weights.mean) + start.penalty(shift, log_ratio)
+            weight = weights.mean
         objectives.append(objective / n)
         if not np.isfinite(objective):
             raise SolverError(f"learning {k} kernels on {n} points diverged in epoch {epoch}")
         if on_epoch:
-            on_epoch(AbhmEpoch(epoch, settings.max_epochs, objectives[-1], hinge, gamma, weights.mean.copy()))
+            on_epoch(AbhmEpoch(epoch, settings.max_epochs, objectives[-1], hinge, gamma, weight.copy()))
         if last:
             break
-        with torch.no_grad():
-            weight.copy_(torch.from_numpy(weights.mean))
-        hinge_start = _tensor(start.hinge - problem.corner)
-        for _ in range(settings.steps):
-            rate = 0.05 + 0.95 * 0.5 * (1.0 + math.cos(math.pi * taken / total))
-            optimiser.param_groups[0]["lr"] = settings.learning_rate * rate
-            optimiser.zero_grad()
-            rows = problem.batches(rng)
-            fit = _log_likelihood(
-                problem,
-                hinge_start + length[:, None] * free_axes * shift,
-                gamma_start * log_ratio.exp(),
-                weight,
-                rows,
+        hinge_start = (start.hinge - problem.corner).astype(np.float32)
+        for first in itertools.islice(problem.batches(rng), settings.steps):
+            ratio = np.exp(log_ratio)
+            gamma_now = gamma_start * ratio
+            _, d_hinge, d_gamma, d_weight = problem.log_likelihood(
+                hinge_start + length * start.free_axes * shift, gamma_now, weight, first
             )
-            prior = (
-                (shift * free_axes).square().sum() / (2.0 * settings.hinge_reach**2)
-                + settings.gamma_shape * (log_ratio.exp() - log_ratio).sum()
-                + weight.square().sum() / (2.0 * settings.weight_var)
+            optimiser.step(
+                [
+                    start.free_axes * (shift / settings.hinge_reach**2 - length * d_hinge),
+                    settings.gamma_shape * (ratio - 1.0) - gamma_now * d_gamma,
+                    weight / settings.weight_var - d_weight,
+                ],
+                settings.learning_rate * min(_half_cosine(taken / total), _COOLING**n_coolings),
             )
-            (prior / n - fit / len(rows)).backward()
-            optimiser.step()
             taken += 1
-        warm = weight.detach().numpy().copy()
-        gain = _relative(objectives[-2] - objectives[-1], objectives[-2]) if len(objectives) > 1 else 1.0
-        n_still = n_still + 1 if gain < settings.tolerance else 0
     # what the last epoch changed, up or down
-    change = (
-        _relative(abs(objectives[-2] - objectives[-1]), objectives[-2]) if len(objectives) > 1 else math.inf
-    )
-    settled = change < 10.0 * settings.tolerance
+    change = abs(objectives[-2] - objectives[-1]) if len(objectives) > 1 else math.inf
+    settled = change <= 10.0 * settings.tolerance * objectives[-1]
     return _Means(hinge, gamma, weights, objectives, settled and weights.converged)
 
 
-def _relative(change: float, whole: float) -> float:
-    """0 where there is nothing to explain."""
-    return change / whole if whole > 0.0 else 0.0
+def _half_cosine(done: float) -> float:
+    """The rate's share of its start when a share of the steps is done: from 1 to a twentieth."""
+    return 0.05 + 0.95 * 0.5 * (1.0 + math.cos(math.pi * done))
 
 
-def _objective(problem: _Problem, weight: Float32) -> float:
-    """Minus the log posterior of the weights, constants left out, nats."""
-    f = np.empty(problem.n, np.float32)
-    rows_dot(
-        problem.features.indptr, problem.features.indices, problem.features.values, weight, 0, problem.n, f
-    )
-    loss = np.logaddexp(0.0, f, dtype=np.float64) - problem.sorted_occupied * f
-    prior = np.square(weight, dtype=np.float64).sum() / (2.0 * problem.settings.weight_var)
-    return float((problem.sorted_count * loss).sum() + prior)
+class _Adam:
+    """Adam (Kingma, Ba, ICLR 2015) on arrays in place: on arrays as small as these torch's takes longer than the gradient."""
+
+    def __init__(self, parameters: list[Float32]) -> None:
+        self._parameters = parameters
+        self._mean = [np.zeros_like(p) for p in parameters]
+        self._square = [np.zeros_like(p) for p in parameters]
+        self._taken = 0
+
+    def step(self, gradients: list[Float32], rate: float) -> None:
+        """One step down."""
+        self._taken += 1
+        size = np.float32(rate / (1.0 - 0.9**self._taken))
+        root = np.float32(1.0 / math.sqrt(1.0 - 0.999**self._taken))
+        for p, g, mean, square in zip(self._parameters, gradients, self._mean, self._square, strict=True):
+            mean += np.float32(0.1) * (g - mean)
+            square += np.float32(0.001) * (g * g - square)
+            p -= size * mean / (root * np.sqrt(square) + np.float32(1e-8))
 
 
 def _learn_dispersions(
-    problem: _Problem, start: _Start, means: _Means, rng: np.random.Generator, seed: int
+    problem: _Problem, start: _Start, means: _Means, rng: np.random.Generator
 ) -> tuple[Float64, Float64, list[float]]:
     """Standard deviations of hinges (K, 3), m, and shapes of gammas (K,), that maximise the evidence lower bound."""
     settings, n, k = start.settings, problem.n, len(means.gamma)
     free_axes, length = torch.from_numpy(start.free_axes), _tensor(start.length)
     hinge, gamma = _tensor(means.hinge - problem.corner), _tensor(means.gamma)
     weight = torch.from_numpy(means.weights.mean)
-    curvature_h, curvature_g = _curvatures(
-        problem.sorted_points, problem.sorted_count, problem.features.indptr, problem.features.indices,
-        hinge.numpy(), gamma.numpy(), means.weights.mean,
-    )  # fmt: skip
+    curvature_h, curvature_g = problem.curvatures(hinge.numpy(), gamma.numpy(), means.weights.mean)
     # in length scales and as log shapes: both of order one
     precision = torch.from_numpy(curvature_h) * length[:, None].square() + 1.0 / settings.hinge_reach**2
     log_sd = (-0.5 * precision.log()).requires_grad_()
@@ -358,29 +412,33 @@ def _learn_dispersions(
         torch.full((k,), settings.gamma_shape), settings.gamma_shape / _tensor(start.gamma)
     )
     shift = (_tensor(means.hinge - start.hinge) / length[:, None]) * free_axes
-    optimiser = torch.optim.Adam([log_sd, log_shape], lr=0.05)
+    optimiser = torch.optim.Adam([log_sd, log_shape])
+    # of this fit's own: others in this process draw from torch's global one
+    generator = torch.Generator().manual_seed(int(rng.integers(2**63)))
     elbos: list[float] = []
     weight_cost = _weight_divergence(means.weights, settings.weight_var) + _weight_noise(
         means.weights, settings.weight_var
     )
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
-        for _ in range(settings.dispersion_epochs):
-            elbo = 0.0
-            for _ in range(settings.steps):
-                optimiser.zero_grad()
-                rows = problem.batches(rng)
-                q_h = torch.distributions.Normal(shift, log_sd.exp())
-                q_g = torch.distributions.Gamma(log_shape.exp(), log_shape.exp() / gamma)
-                moved = (q_h.rsample() - shift) * length[:, None] * free_axes
-                fit = _log_likelihood(problem, hinge + moved, q_g.rsample(), weight, rows)
-                divergence = (torch.distributions.kl_divergence(q_h, prior_h) * free_axes).sum()
-                divergence = divergence + torch.distributions.kl_divergence(q_g, prior_g).sum()
-                bound = fit / len(rows) - divergence / n
-                (-bound).backward()
-                optimiser.step()
-                elbo += float(bound.detach())
-            elbos.append(elbo / settings.steps - weight_cost / n)
+    total = settings.dispersion_epochs * settings.dispersion_steps
+    for epoch in range(settings.dispersion_epochs):
+        elbo = 0.0
+        for step, first in enumerate(itertools.islice(problem.batches(rng), settings.dispersion_steps)):
+            done = (epoch * settings.dispersion_steps + step) / total
+            optimiser.param_groups[0]["lr"] = _DISPERSION_RATE * _half_cosine(done)
+            optimiser.zero_grad()
+            q_h = torch.distributions.Normal(shift, log_sd.exp())
+            q_g = torch.distributions.Gamma(log_shape.exp(), log_shape.exp() / gamma)
+            moved = q_h.scale * torch.randn((k, 3), generator=generator) * length[:, None] * free_axes
+            # what q_g.rsample() does, with a generator of our own; its gradient in the shape is implicit (Figurnov et al. 2018)
+            drawn = torch._standard_gamma(q_g.concentration, generator=generator) / q_g.rate
+            fit = _log_likelihood(problem, hinge + moved, drawn.clamp_min(_LEAST_GAMMA), weight, first)
+            divergence = (torch.distributions.kl_divergence(q_h, prior_h) * free_axes).sum()
+            divergence = divergence + torch.distributions.kl_divergence(q_g, prior_g).sum()
+            bound = (fit - divergence) / n
+            (-bound).backward()
+            optimiser.step()
+            elbo += float(bound.detach())
+        elbos.append(elbo / settings.dispersion_steps - weight_cost / n)
     with torch.no_grad():
         sd = (log_sd.exp() * length[:, None] * free_axes).double().numpy()
         shape = log_shape.double().exp().numpy()
@@ -389,7 +447,7 @@ def _learn_dispersions(
     return sd, shape, elbos
 
 
-def _weight_divergence(weights: WeightPosterior, prior_var: float) -> float:
+def _weight_divergence(weights: _Weights, prior_var: float) -> float:
     """KL of the weights' posterior from their prior, nats."""
     ratio = weights.var.astype(np.float64) / prior_var
     return float(
@@ -397,7 +455,7 @@ def _weight_divergence(weights: WeightPosterior, prior_var: float) -> float:
     )
 
 
-def _weight_noise(weights: WeightPosterior, prior_var: float) -> float:
+def _weight_noise(weights: _Weights, prior_var: float) -> float:
     """What the weights' variance takes from the expected log-likelihood, to second order, nats.
 
     1 / var is the curvature of likelihood and prior together, so the likelihood's share of it is 1 - var / prior_var.
@@ -409,9 +467,9 @@ class _LogLikelihood(torch.autograd.Function):
     """Sum of log-likelihoods over some rows; differentiable in hinges, gammas and weights."""
 
     @staticmethod
-    def forward(ctx: Any, problem: Any, hinge: Any, gamma: Any, weight: Any, rows: Any) -> Any:
+    def forward(ctx: Any, problem: Any, hinge: Any, gamma: Any, weight: Any, first: Any) -> Any:
         total, *gradients = problem.log_likelihood(
-            hinge.detach().numpy(), gamma.detach().numpy(), weight.detach().numpy(), rows
+            hinge.detach().numpy(), gamma.detach().numpy(), weight.detach().numpy(), first
         )
         ctx.save_for_backward(*map(torch.from_numpy, gradients))
         return hinge.new_tensor(total)
@@ -427,79 +485,102 @@ def _log_likelihood(
     hinge: torch.Tensor,
     gamma: torch.Tensor,
     weight: torch.Tensor,
-    rows: NDArray[np.int64],
+    first: NDArray[np.int64],
 ) -> torch.Tensor:
-    return _LogLikelihood.apply(problem, hinge, gamma, weight, rows)
+    return _LogLikelihood.apply(problem, hinge, gamma, weight, first)
 
 
 def _tensor(array: Float64) -> torch.Tensor:
     return torch.from_numpy(array.astype(np.float32))
 
 
+# The inner loops get slices, so that the compiler makes SIMD code of them; see feature_blocks.py.
 @nb.njit(nogil=True, fastmath=FAST, error_model="numpy", cache=True)
-def _rows_gradient(points, occupied, count, rows, indptr, indices, hinge, gamma, weight):
-    """Sum of count * log-likelihood over some rows, and its gradients, in one pass: a row's activations stay in cache."""
-    width = 0
-    for r in rows:
-        width = max(width, indptr[r + 1] - indptr[r])
-    phi, d2 = np.empty(width, np.float32), np.empty(width, np.float32)
-    d_hinge = np.zeros(hinge.shape, np.float32)
-    d_gamma, d_weight = np.zeros(len(gamma), np.float32), np.zeros(len(gamma), np.float32)
+def _forward(x, y, z, hx, hy, hz, g, w, phi, d2):
+    f = np.float32(0)
+    for i in range(len(phi)):
+        dx, dy, dz = x - hx[i], y - hy[i], z - hz[i]
+        q = dx * dx + dy * dy + dz * dz
+        p = exp32(-g[i] * q)
+        d2[i] = q
+        phi[i] = p
+        f += w[i] * p
+    return f
+
+
+@nb.njit(nogil=True, fastmath=FAST, error_model="numpy", cache=True)
+def _backward(residual, x, y, z, hx, hy, hz, g, w, phi, d2, by_x, by_y, by_z, by_g, by_w):
+    for i in range(len(phi)):
+        t = residual * phi[i]
+        by_w[i] += t
+        t *= w[i]
+        by_g[i] -= t * d2[i]
+        t *= np.float32(2) * g[i]
+        by_x[i] += t * (x - hx[i])
+        by_y[i] += t * (y - hy[i])
+        by_z[i] += t * (z - hz[i])
+
+
+@nb.njit(nogil=True, error_model="numpy", cache=True)
+def _gradient(x, occupied, count, cuts, kernels, numbers, columns, first, stride, negligible):
+    """Sum of count * log-likelihood over every `stride`-th point of each cube, and its gradient (5, K) in `columns`."""
+    out = np.zeros(columns.shape, np.float32)
+    widest = 0
+    for c in range(len(cuts) - 1):
+        widest = max(widest, kernels[c + 1] - kernels[c])
+    near, by = np.empty((5, widest), np.float32), np.empty((5, widest), np.float32)
+    phi_of, d2_of = np.empty(widest, np.float32), np.empty(widest, np.float32)
     total = 0.0
-    for r in rows:
-        first, last = indptr[r], indptr[r + 1]
-        x, y, z = points[r, 0], points[r, 1], points[r, 2]
-        f = np.float32(0)
-        for e in range(first, last):
-            m = indices[e]
-            dx, dy, dz = x - hinge[m, 0], y - hinge[m, 1], z - hinge[m, 2]
-            q = dx * dx + dy * dy + dz * dz
-            d2[e - first] = q
-            phi[e - first] = exp32(-gamma[m] * q)
-            f += weight[m] * phi[e - first]
-        margin = f if occupied[r] else -f
-        small = exp32(-abs(margin))
-        total += count[r] * (min(margin, np.float32(0)) - np.log1p(small))
-        wrong = small / (np.float32(1) + small) if margin > 0 else np.float32(1) / (np.float32(1) + small)
-        residual = count[r] * (wrong if occupied[r] else -wrong)
-        if abs(residual) < _NEGLIGIBLE:
+    for c in range(len(cuts) - 1):
+        if cuts[c] + first[c] >= cuts[c + 1]:
             continue
-        for e in range(first, last):
-            m = indices[e]
-            t = residual * phi[e - first]
-            d_weight[m] += t
-            t *= weight[m]
-            d_gamma[m] -= t * d2[e - first]
-            t *= np.float32(2) * gamma[m]
-            d_hinge[m, 0] += t * (x - hinge[m, 0])
-            d_hinge[m, 1] += t * (y - hinge[m, 1])
-            d_hinge[m, 2] += t * (z - hinge[m, 2])
-    return total, d_hinge, d_gamma, d_weight
+        at, n = kernels[c], kernels[c + 1] - kernels[c]
+        for i in range(n):
+            m = numbers[at + i]
+            for row in range(5):
+                near[row, i] = columns[row, m]
+        by[:, :n] = 0
+        hx, hy, hz, g, w = near[0, :n], near[1, :n], near[2, :n], near[3, :n], near[4, :n]
+        phi, d2 = phi_of[:n], d2_of[:n]
+        for r in range(cuts[c] + first[c], cuts[c + 1], stride):
+            f = _forward(x[0, r], x[1, r], x[2, r], hx, hy, hz, g, w, phi, d2)
+            margin = f if occupied[r] else -f
+            small = exp32(-abs(margin))
+            total += count[r] * (min(margin, np.float32(0)) - np.log1p(small))
+            wrong = small / (np.float32(1) + small) if margin > 0 else np.float32(1) / (np.float32(1) + small)
+            residual = count[r] * (wrong if occupied[r] else -wrong)
+            if abs(residual) >= negligible:
+                _backward(
+                    residual, x[0, r], x[1, r], x[2, r], hx, hy, hz, g, w, phi, d2,
+                    by[0, :n], by[1, :n], by[2, :n], by[3, :n], by[4, :n],
+                )  # fmt: skip
+        for i in range(n):
+            m = numbers[at + i]
+            for row in range(5):
+                out[row, m] += by[row, i]
+    return total, out
 
 
-@nb.njit(nogil=True, fastmath=FAST, error_model="numpy", cache=True)
-def _curvatures(points, count, indptr, indices, hinge, gamma, weight):
-    """Gauss-Newton curvature of the log-likelihood: in each hinge coordinate (K, 3), 1/m^2, and in each log gamma (K,)."""
-    by_hinge, by_gamma = np.zeros(hinge.shape, np.float32), np.zeros(len(gamma), np.float32)
-    for r in range(len(points)):
-        first, last = indptr[r], indptr[r + 1]
-        f = np.float32(0)
-        for turn in range(2):
-            p = np.float32(1) / (np.float32(1) + exp32(-f))
-            curvature = count[r] * p * (np.float32(1) - p)
-            for e in range(first, last):
-                m = indices[e]
-                d2 = np.float32(0)
-                for c in range(3):
-                    d = points[r, c] - hinge[m, c]
-                    d2 += d * d
-                t = weight[m] * exp32(-gamma[m] * d2)
-                if turn == 0:
-                    f += t
-                    continue
-                t *= gamma[m]
-                by_gamma[m] += curvature * t * t * d2 * d2
-                for c in range(3):
-                    slope = np.float32(2) * t * (points[r, c] - hinge[m, c])
-                    by_hinge[m, c] += curvature * slope * slope
-    return by_hinge, by_gamma
+@nb.njit(nogil=True, error_model="numpy", cache=True)
+def _curvatures(x, count, cuts, kernels, numbers, columns):
+    """Gauss-Newton curvature (4, K) of the log-likelihood: in each hinge coordinate, 1/m^2, and in each log gamma."""
+    out = np.zeros((4, columns.shape[1]), np.float32)
+    for c in range(len(cuts) - 1):
+        at, n = kernels[c], kernels[c + 1] - kernels[c]
+        near = np.empty((5, n), np.float32)
+        for i in range(n):
+            for row in range(5):
+                near[row, i] = columns[row, numbers[at + i]]
+        phi, d2 = np.empty(n, np.float32), np.empty(n, np.float32)
+        for r in range(cuts[c], cuts[c + 1]):
+            f = _forward(x[0, r], x[1, r], x[2, r], near[0], near[1], near[2], near[3], near[4], phi, d2)
+            small = exp32(-abs(f))
+            curvature = count[r] * small / np.square(np.float32(1) + small)
+            for i in range(n):
+                t = near[4, i] * phi[i] * near[3, i]
+                m = numbers[at + i]
+                for axis in range(3):
+                    slope = np.float32(2) * t * (x[axis, r] - near[axis, i])
+                    out[axis, m] += curvature * slope * slope
+                out[3, m] += curvature * t * t * d2[i] * d2[i]
+    return out

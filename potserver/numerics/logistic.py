@@ -1,11 +1,9 @@
-"""Bayesian logistic regression of kernel weights: two solvers of one problem.
+"""Bayesian logistic regression of kernel weights.
 
     maximise  sum_n log p(y_n | f_n) - 1/2 sum_m (w_m - prior_mean_m)^2 / prior_var_m,    f_n = offset_n + sum_m w_m phi_m(x_n)
 
-`fit_sparse` is for maps at run time and for learning atoms: Newton steps whose linear systems are solved by conjugate
-gradients on sparse features.
-`fit_dense` is what it is held to: exact Newton by Cholesky in float64, with the log evidence.
-Both keep the prior fixed and count every datum once; the RSS 2020 code does neither, and its diagonal updates overshoot.
+Newton steps whose linear systems are solved by conjugate gradients on sparse features. The prior stays fixed and every datum
+counts once; the RSS 2020 code does neither, and its diagonal updates overshoot.
 """
 
 from __future__ import annotations
@@ -228,82 +226,3 @@ def _rows_normal(indptr, indices, values, curvature, direction, first, last):
         for e in range(indptr[i], indptr[i + 1]):
             out[indices[e]] += values[e] * s
     return out
-
-
-class DensePosterior(NamedTuple):
-    """Laplace approximation of the weights, exact linear algebra in float64."""
-
-    mean: Float64  # (K,) log-odds
-    var: Float64  # (K,) log-odds^2: 1 / diagonal of the Hessian
-    log_evidence: float
-    n_newton: int
-    converged: bool
-
-
-def fit_dense(
-    features: Float64,
-    labels: NDArray[np.bool_],
-    prior_mean: Float64,
-    prior_var: Float64,
-    *,
-    tolerance: float = 1e-6,
-    max_newton: int = 50,
-    device: str = "cpu",
-) -> DensePosterior:
-    """Fit the weights of K kernels to N labelled points, exactly; O(N K^2) a step.
-
-    Args:
-        features: (N, K) float64, phi.
-        labels: (N,) true = occupied.
-        prior_mean: (K,) log-odds.
-        prior_var: (K,) log-odds^2, > 0.
-        tolerance: Newton decrement, per datum, at which it stops.
-        max_newton: Newton steps at most.
-        device: Where torch computes.
-    Source: Laplace approximation of Bayesian logistic regression, MacKay 1992.
-    """
-    import torch  # here and not above: it takes seconds to load, and servers do without it
-
-    phi = torch.as_tensor(features, dtype=torch.float64, device=device)
-    y = torch.as_tensor(labels, device=device).to(torch.float64)
-    mean0 = torch.as_tensor(prior_mean, dtype=torch.float64, device=device)
-    precision = 1.0 / torch.as_tensor(prior_var, dtype=torch.float64, device=device)
-
-    def objective(w):
-        f = phi @ w
-        loss = torch.nn.functional.softplus(f) - y * f
-        return loss.sum() + 0.5 * (precision * (w - mean0).square()).sum()
-
-    w = mean0.clone()
-    value = objective(w)
-    converged, steps = False, 0
-    while True:
-        p = torch.sigmoid(phi @ w)
-        gradient = phi.T @ (p - y) + precision * (w - mean0)
-        hessian = (phi * (p * (1 - p))[:, None]).T @ phi
-        hessian.diagonal().add_(precision)
-        factor = torch.linalg.cholesky(hessian)
-        step = -torch.cholesky_solve(gradient[:, None], factor)[:, 0]
-        decrement = -float(gradient @ step)
-        if decrement <= tolerance * max(1, len(y)):
-            converged = True
-            break
-        if steps == max_newton:
-            break
-        steps += 1
-        size = 1.0
-        while size > 1e-6:
-            trial = objective(w + size * step)
-            if float(trial) <= float(value) - 1e-4 * size * decrement:
-                break
-            size *= 0.5
-        w = w + size * step
-        value = trial
-    log_det = 2.0 * torch.log(factor.diagonal()).sum() - torch.log(precision).sum()
-    return DensePosterior(
-        mean=w.cpu().numpy(),
-        var=(1.0 / hessian.diagonal()).cpu().numpy(),
-        log_evidence=float(-value - 0.5 * log_det),
-        n_newton=steps,
-        converged=converged,
-    )

@@ -5,7 +5,8 @@
 Unlike `logistic.fit_sparse` it does a fixed amount of work and is never far from the last optimum, but for where the world has
 changed. There plain Newton gets stuck: a row that is surely wrong has no curvature left, steps overshoot and every line search
 fails. Rows on the wrong side take the curvature of the quadratic bound of Jaakkola and Jordan (1997), with which no
-step overshoots, and every row has a least curvature.
+step overshoots, and every row has a least curvature: the higher, the more cautious the steps, and the farther from the optimum
+they end. Without a floor to speak of and with more steps this is a solver like any other, the fastest one here.
 """
 
 from __future__ import annotations
@@ -21,7 +22,6 @@ from potserver.numerics.feature_blocks import Blocks, gradient_and_diagonal, nor
 Float32 = NDArray[np.float32]
 Bool = NDArray[np.bool_]
 
-_LEAST_CURVATURE = np.float32(0.01)  # of a row that counts once
 _SHRINK, _TRIALS = 0.25, 12  # of the line search
 _ENOUGH = 1e-5  # relative gain of the objective below which more steps are not worth it
 
@@ -49,6 +49,7 @@ def warm_fit(
     free: Bool | None = None,
     n_newton: int = 2,
     n_conjugate_gradient: int = 4,
+    least_curvature: float = 0.01,
     threads: int = 1,
 ) -> WarmFit:
     """Improve the weights of K kernels on N labelled rows.
@@ -63,6 +64,7 @@ def warm_fit(
         free: (K,) which weights may change; all by default. The others still count in f.
         n_newton: Newton steps at most.
         n_conjugate_gradient: Conjugate-gradient steps for each.
+        least_curvature: Of a row that counts once, > 0.
         threads: Threads for the products with the features.
     """
     y, c = labels[blocks.order], np.ascontiguousarray(counts[blocks.order], np.float32)
@@ -81,7 +83,7 @@ def warm_fit(
     value = at_start = objective(f, np.zeros_like(w), 0.0)
     steps, converged = 0, True
     while steps < n_newton:
-        residual, curvature = _terms(f, y, c)
+        residual, curvature = _terms(f, y, c, np.float32(least_curvature))
         gradient, diagonal = gradient_and_diagonal(blocks, residual, curvature, threads=threads)
         diagonal = diagonal + precision
         gradient = (gradient + precision * (w - prior_mean)) * mask
@@ -137,7 +139,7 @@ def _conjugate_gradient(apply, rhs: Float32, diagonal: Float32, n_steps: int) ->
 
 
 @nb.njit(nogil=True, error_model="numpy", cache=True)
-def _terms(f, y, c):
+def _terms(f, y, c, least):
     residual = np.empty(len(f), np.float32)
     curvature = np.empty(len(f), np.float32)
     one, half = np.float32(1), np.float32(0.5)
@@ -149,7 +151,7 @@ def _terms(f, y, c):
         q = p * (one - p)
         if y[i] != (x > 0) and abs(x) > np.float32(0.01):
             q = (p - half) / x
-        curvature[i] = c[i] * max(q, _LEAST_CURVATURE)
+        curvature[i] = c[i] * max(q, least)
     return residual, curvature
 
 

@@ -15,9 +15,7 @@ from potserver.numerics.geometry import rotation_z
 from potserver.services.atom_distance import atom_distances
 from potserver.services.settings import MappingSettings
 
-# whatever is nearly as far as the farthest may be taken in its place if it is better
-_NEARLY = 0.9
-_DISTANCE_DECIMALS, _NLL_DECIMALS = 3, 4  # compared in these: last bits must not decide
+_DISTANCE_DECIMALS = 3  # compared in these: last bits must not decide
 # points compared, of each label; with half of them, two draws of one outdoor sector are 3 m apart, with these 2 m
 _HITS, _FREE = 200, 120
 _QUANTILES = (np.arange(16) + 0.5) / 16
@@ -35,7 +33,7 @@ class Cover(NamedTuple):
 
 def greedy_cover(
     atoms: Sequence[Atom],
-    nll: ArrayLike,
+    content_nats: ArrayLike,
     tolerance_m: ArrayLike,
     *,
     max_atoms: int | None = None,
@@ -44,16 +42,19 @@ def greedy_cover(
     threads: int = 1,
     on_chosen: Callable[[int, int], None] | None = None,
 ) -> Cover:
-    """Begin with the best atom; then, again and again, take the one farthest from all chosen, until all are near enough.
+    """Begin with the atom that says most; then, again and again, take what would be missed most, until all are near enough.
 
-    Distances are those of `distances_m`. An atom counts as far in units of its own tolerance; among those at least nine tenths
-    as far as the farthest, the one with the lowest NLL is taken. What is covered is never compared again, so the work is at
-    most one distance for each chosen atom and each candidate, and far less when many are alike. The choice does not depend on
-    the order of the candidates.
+    What is missed without an atom is its content times its distance from all chosen, in units of its own tolerance: a
+    farthest-first cover with weights. A lone wall at arm's length has the lowest NLL of all and says next to nothing, since a
+    constant would have predicted it nearly as well; so atoms are weighed by what they tell, and not by how well they do.
+    Distances are those of `distances_m`. What is covered is never compared again, so the work is at most one distance for
+    each chosen atom and each candidate, and far less when many are alike. The choice does not depend on the order of the
+    candidates.
 
     Args:
         atoms: N candidates of one number of dimensions, with different ids.
-        nll: (N,) how good each is, lower is better.
+        content_nats: (N,) how much each tells about the beams held out of it: the gain in log-likelihood over the share of
+            occupied points among them, summed over these points. Less than 1 counts as 1.
         tolerance_m: (N,) or one number: a candidate this near to a chosen atom is not needed.
         max_atoms: Stop at so many, covered or not.
         group: (N,) numbers from 0, for `max_of_group`; default: all in group 0.
@@ -67,11 +68,11 @@ def greedy_cover(
     n = len(atoms)
     if n == 0:
         raise EmptyError("no atoms to choose from")
-    quality = np.round(np.asarray(nll, np.float64), _NLL_DECIMALS)
+    content = np.maximum(np.round(np.asarray(content_nats, np.float64)), 1.0)
     tolerance = np.broadcast_to(np.asarray(tolerance_m, np.float64), n)
     groups = np.zeros(n, np.int64) if group is None else np.asarray(group, np.int64)
-    if quality.shape != (n,) or groups.shape != (n,):
-        raise ShapeError(f"{n} atoms, but nll {quality.shape} and group {groups.shape}")
+    if content.shape != (n,) or groups.shape != (n,):
+        raise ShapeError(f"{n} atoms, but content_nats {content.shape} and group {groups.shape}")
     left = dict(enumerate(max_of_group))
     compared = _Compared(atoms, threads)
     distance = np.full(n, np.inf)
@@ -79,9 +80,9 @@ def greedy_cover(
     is_open = np.ones(n, bool)
     chosen: list[int] = []
     while is_open.any() and (max_atoms is None or len(chosen) < max_atoms):
-        far = np.where(is_open, distance / np.maximum(tolerance, 1e-9), -1.0)
-        pool = np.flatnonzero(far >= _NEARLY * far.max()) if chosen else np.flatnonzero(is_open)
-        best = min(pool.tolist(), key=lambda i: (quality[i], atoms[i].atom_id))
+        far = distance / np.maximum(tolerance, 1e-9) if chosen else np.ones(n)
+        missed = np.where(is_open, content * far, -1.0)
+        best = min(np.flatnonzero(missed == missed.max()).tolist(), key=lambda i: atoms[i].atom_id)
         chosen.append(best)
         is_open[best], covered_by[best], distance[best] = False, best, 0.0
         compared.lower(distance, best, np.flatnonzero(is_open))

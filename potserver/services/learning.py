@@ -41,6 +41,7 @@ class LearningSettings:
     gamma_shape: float = 2.0
     max_epochs: int = 10
     dispersion_epochs: int = 4
+    dispersion_steps: int = 30
     steps: int = 60
     batch: int = 2_000
     learning_rate: float = 0.1
@@ -138,11 +139,14 @@ def learn_atoms(
             error is raised.
     Raises:
         EmptyError: no scans.
+        SettingsError: the seed is negative.
         SolverError: a sector's learning diverged, and nobody asked to be told.
     """
     window = [scans] if isinstance(scans, Scan) else list(scans)
     if not window:
         raise EmptyError("no scans to learn from")
+    if seed < 0:
+        raise SettingsError(f"seed must be at least 0, got {seed}")
     rng = np.random.default_rng(seed)
     atoms = []
     for number, width_rad, local, labels in cut_sectors(window, settings, rng):
@@ -202,7 +206,11 @@ def learn_kernels(
         occupied: (N,) labels.
         settings: How.
         seed, threads, on_epoch: As for `fit_abhm`.
+    Raises:
+        SettingsError: the seed is negative.
     """
+    if seed < 0:
+        raise SettingsError(f"seed must be at least 0, got {seed}")
     if len(points) > settings.max_labelled:
         drawn = np.random.default_rng(seed).choice(len(points), settings.max_labelled, replace=False)
         points, occupied = points[drawn], occupied[drawn]
@@ -223,20 +231,21 @@ def beam_weights(occupied: Bool, free_per_beam: int) -> Float32:
 def lattice(points: Float64, n_kernels: int) -> tuple[Float64, Float64]:
     """Hinges (K, 3), m, and gammas (K,), 1/m^2, on the finest cubic lattice that has at most `n_kernels` cells with points.
 
-    Cells are aligned to the origin, so points all about it fill up to eight of the coarsest ones, however few are wanted.
-    Points of one plane give hinges in that plane.
+    Cells start at the points' lower corner, so that one kernel is enough if only one is wanted. Points of one plane give
+    hinges in that plane.
     """
-    flat = np.ptp(points, axis=0) == 0.0
-    coarse = max(float(np.ptp(points, axis=0).max()), 1e-3)
+    lower, extent = points.min(axis=0), np.ptp(points, axis=0)
+    flat = extent == 0.0
+    coarse = 1.001 * max(float(extent.max()), 1e-3)  # one cell holds them all
     fine = coarse / 1024.0
     for _ in range(24):  # bisection of the spacing
         spacing = (coarse * fine) ** 0.5
-        if len(voxel_pick(points, spacing)) > n_kernels:
+        if len(voxel_pick(points - lower, spacing)) > n_kernels:
             fine = spacing
         else:
             coarse = spacing
-    picked = voxel_pick(points, coarse)
-    hinge = (np.floor(points[picked] / coarse) + 0.5) * coarse
+    picked = voxel_pick(points - lower, coarse)
+    hinge = lower + (np.floor((points[picked] - lower) / coarse) + 0.5) * coarse
     hinge[:, flat] = points[0, flat]
     return hinge, np.full(len(hinge), 0.5 / (_LENGTH_IN_SPACINGS * coarse) ** 2)
 

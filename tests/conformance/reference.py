@@ -178,3 +178,52 @@ def sector(
         free_points=np.asarray(free, np.float32).reshape(-1, 3),
         T_map_sector=yaw_pose(0.0, 0.0, 0.0),
     )
+
+
+class Dense(NamedTuple):
+    """Laplace approximation of K weights."""
+
+    mean: Float64  # (K,) log-odds
+    var: Float64  # (K,) log-odds^2: 1 / diagonal of the Hessian
+
+
+def fit_dense(
+    features: Float64,
+    labels: ArrayLike,
+    prior_mean: ArrayLike,
+    prior_var: ArrayLike,
+    *,
+    tolerance: float = 1e-14,
+    max_newton: int = 500,
+) -> Dense:
+    """Bayesian logistic regression of weights by Newton's method with a dense Hessian; MacKay 1992.
+
+    Args:
+        features: (N, K) phi.
+        labels: (N,) true = occupied.
+        prior_mean: (K,) log-odds.
+        prior_var: (K,) log-odds^2, > 0.
+        tolerance: Newton decrement, per datum, at which it stops.
+        max_newton: Newton steps at most; an assertion fails when they are not enough.
+    """
+    y, mean = np.asarray(labels, np.float64), np.asarray(prior_mean, np.float64)
+    precision = 1.0 / np.asarray(prior_var, np.float64)
+
+    def objective(w: Float64) -> float:
+        f = features @ w
+        return float((np.logaddexp(0.0, f) - y * f).sum() + 0.5 * (precision * np.square(w - mean)).sum())
+
+    w = mean.copy()
+    for _ in range(max_newton):
+        p = expit(features @ w)
+        gradient = features.T @ (p - y) + precision * (w - mean)
+        hessian = (features * (p * (1.0 - p))[:, None]).T @ features + np.diag(precision)
+        step = -np.linalg.solve(hessian, gradient)
+        decrement = -float(gradient @ step)
+        if decrement <= tolerance * max(1, len(y)):
+            return Dense(w, 1.0 / hessian.diagonal())
+        size = 1.0
+        while size > 1e-6 and objective(w + size * step) > objective(w) - 1e-4 * size * decrement:
+            size *= 0.5
+        w = w + size * step
+    raise AssertionError(f"no optimum in {max_newton} Newton steps")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import itertools
+from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import numpy as np
@@ -16,13 +17,12 @@ from scipy.special import expit
 from potserver.errors import EmptyError, ShapeError, SolverError
 from potserver.numerics import abhm
 from potserver.numerics.abhm import AbhmEpoch, AbhmPosterior, AbhmSettings, fit_abhm
-from potserver.numerics.logistic import WeightPosterior, fit_dense
+from tests.conformance.reference import fit_dense
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 
 QUICK = AbhmSettings(max_epochs=4, dispersion_epochs=2, steps=10, batch=150)
-CUT = 3e-3  # activations below this the learner leaves out
 
 
 class Data(NamedTuple):
@@ -70,6 +70,16 @@ def _problem(data: Data, hinge: Float64, gamma: Float64, *, batch: int = 150, th
     problem = abhm._Problem(data.points, data.occupied, data.count, settings, threads)
     problem.gather(hinge, gamma)
     return problem
+
+
+def _rows(problem, first: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Which points are in a batch, by their number in the problem's order."""
+    starts = np.concatenate([part.cuts[:-1] for part in problem.blocks.parts])
+    ends = np.concatenate([part.cuts[1:] for part in problem.blocks.parts])
+    assert len(starts) == len(first)
+    return np.concatenate(
+        [np.arange(a + f, b, problem.n_batches) for a, b, f in zip(starts, ends, first, strict=True)]
+    )
 
 
 @pytest.fixture
@@ -126,6 +136,7 @@ def test_what_cannot_be_learned_is_refused(change: dict, error: type[Exception],
         ("max_epochs", -1),
         ("dispersion_epochs", -1),
         ("steps", 0),
+        ("dispersion_steps", 0),
         ("batch", 0),
     ],
 )
@@ -134,28 +145,35 @@ def test_settings_that_make_no_sense_are_refused(name: str, value: float) -> Non
         AbhmSettings(**{name: value})
 
 
+def test_a_negative_seed_is_refused() -> None:
+    with pytest.raises(ShapeError, match="seed"):
+        _data().fit(seed=-1)
+
+
 # --- the pieces, against float64 --------------------------------------------------------------------------------------
 
 
 @pytest.mark.usefixtures("_no_cut")
 @pytest.mark.parametrize("flat", [None, 2], ids=["3d", "2d"])
 @pytest.mark.parametrize("threads", [1, 3])
-@pytest.mark.parametrize("some", [False, True], ids=["all rows", "some rows"])
+@pytest.mark.parametrize("batch", [400, 100], ids=["all points", "some points"])
 def test_the_log_likelihood_and_its_gradients_are_those_of_torch(
-    flat: int | None, threads: int, some: bool
+    flat: int | None, threads: int, batch: int
 ) -> None:
     data = _data(flat=flat)
     at = _somewhere(data)
-    problem = _problem(data, at[0], at[1], threads=threads)
-    rows = np.sort(np.random.default_rng(2).choice(400, 70, replace=False)) if some else np.arange(400)
+    problem = _problem(data, at[0], at[1], batch=batch, threads=threads)
+    first = next(problem.batches(np.random.default_rng(2)))
+    rows = _rows(problem, first)
+    assert (len(rows) == 400) == (batch == 400)
 
     exact = [torch.from_numpy(a).requires_grad_() for a in at]
-    truth = _log_likelihood(data, *exact, rows=problem.features.order[rows])
+    truth = 400 / batch * _log_likelihood(data, *exact, rows=problem.blocks.order[rows])
     (0.5 * truth).backward()
 
     given = [at[0] - problem.corner, at[1], at[2]]
     ours = [torch.from_numpy(a.astype(np.float32)).requires_grad_() for a in given]
-    value = abhm._log_likelihood(problem, *ours, rows)
+    value = abhm._log_likelihood(problem, *ours, first)
     (0.5 * value).backward()
 
     assert value.item() == pytest.approx(truth.item(), rel=1e-5)
@@ -173,10 +191,9 @@ def test_curvatures_are_those_of_gauss_and_newton() -> None:
     data = _data(flat=None)
     hinge, gamma, weight = _somewhere(data)
     problem = _problem(data, hinge, gamma)
-    by_hinge, by_gamma = abhm._curvatures(
-        problem.sorted_points, problem.sorted_count, problem.features.indptr, problem.features.indices,
-        (hinge - problem.corner).astype(np.float32), gamma.astype(np.float32), weight.astype(np.float32),
-    )  # fmt: skip
+    by_hinge, by_gamma = problem.curvatures(
+        *(a.astype(np.float32) for a in (hinge - problem.corner, gamma, weight))
+    )
     away = data.points[:, None] - hinge
     d2 = np.square(away).sum(axis=2)
     phi = np.exp(-gamma * d2)
@@ -187,13 +204,13 @@ def test_curvatures_are_those_of_gauss_and_newton() -> None:
     np.testing.assert_allclose(by_gamma, (each * np.square(weight * phi * gamma * d2)).sum(axis=0), rtol=1e-3)
 
 
+@pytest.mark.usefixtures("_no_cut")
 def test_the_first_dispersions_are_laplaces() -> None:
     """With no epoch of the dispersions they stay at the curvature of posterior and prior."""
     data = _data()
     settings = dataclasses.replace(QUICK, max_epochs=0, dispersion_epochs=0, hinge_reach=0.7, gamma_shape=3.0)
     fit = data.fit(settings, sample_weight=data.count)
     phi = np.exp(-data.gamma * np.square(data.points[:, None] - data.hinge).sum(axis=2))
-    phi[phi < CUT] = 0.0
     away = data.points[:, None] - data.hinge
     p = expit(phi @ fit.weight_mean)
     each = (data.count * p * (1 - p))[:, None, None]
@@ -206,44 +223,47 @@ def test_the_first_dispersions_are_laplaces() -> None:
     assert fit.elbos == []
 
 
-def test_a_step_sees_every_point_equally_often() -> None:
-    """So a mini-batch's mean gradient is the whole's in expectation."""
+def test_a_pass_sees_every_point_once_and_a_step_some_of_every_place() -> None:
+    """So the steps of a pass add up to the whole gradient, whatever the pass begins with."""
     data = _data()
     hinge, gamma, weight = _somewhere(data)
     problem = _problem(data, hinge, gamma, batch=60)
+    assert problem.n_batches == 7
     at = [a.astype(np.float32) for a in (hinge - problem.corner, gamma, weight)]
-    whole = problem.log_likelihood(*at, np.arange(400))
-    rng, n_draws = np.random.default_rng(0), 600
-    drawn = np.zeros(400)
-    estimates = []
-    for _ in range(n_draws):
-        rows = problem.batches(rng)
-        assert len(np.unique(rows)) == len(rows) == 60
-        drawn[rows] += 1
-        estimates.append(problem.log_likelihood(*at, rows)[3] / 60)
-    expected = n_draws * 60 / 400
-    assert np.square(drawn - expected).sum() / expected < 400 + 5 * np.sqrt(800), (
-        "chi squared, five deviations"
+    whole = _problem(data, hinge, gamma, batch=400).log_likelihood(*at, np.zeros(400, np.int64))
+    batches = problem.batches(np.random.default_rng(0))
+    starts = []
+    for _ in range(20):
+        steps = [next(batches) for _ in range(7)]
+        starts.append(steps[0])
+        rows = [_rows(problem, first) for first in steps]
+        np.testing.assert_array_equal(np.sort(np.concatenate(rows)), np.arange(400))
+        for first in steps:
+            assert np.isin(first, np.arange(7)).all()
+        parts = [problem.log_likelihood(*at, first) for first in steps]
+        assert sum(part[0] for part in parts) / 7 == pytest.approx(whole[0], rel=1e-6)
+        for which in (1, 2, 3):
+            together = np.mean([part[which] for part in parts], axis=0)
+            np.testing.assert_allclose(together, whole[which], atol=1e-4 * np.abs(whole[which]).max())
+    counts = np.bincount(np.concatenate(starts), minlength=7)
+    assert np.square(counts - counts.mean()).sum() / counts.mean() < 6 + 5 * np.sqrt(12), (
+        "chi squared, five deviations: no place begins with the same points in every pass"
     )
-    error = np.mean(estimates, axis=0) - whole[3] / 400
-    deviation = np.std(estimates, axis=0) / np.sqrt(n_draws)
-    assert (np.abs(error) < 5.0 * deviation).all()
-    assert (np.abs(whole[3] / 400) > 5.0 * deviation).any(), "the test can tell the gradient from nothing"
-    np.testing.assert_array_equal(_problem(data, hinge, gamma, batch=400).batches(rng), np.arange(400))
 
 
-def test_a_sum_over_rows_is_the_sum_of_its_parts() -> None:
+def test_what_counts_for_nothing_depends_on_how_much_points_count() -> None:
+    """Points of much weight are never left out for a residual that is small only beside it; points of little weight stay in."""
     data = _data()
     hinge, gamma, weight = _somewhere(data)
-    problem = _problem(data, hinge, gamma)
-    at = [a.astype(np.float32) for a in (hinge - problem.corner, gamma, weight)]
-    whole = problem.log_likelihood(*at, np.arange(400))
-    shuffled = np.random.default_rng(0).permutation(400)
-    parts = [problem.log_likelihood(*at, rows) for rows in np.array_split(shuffled, 7)]
-    assert sum(part[0] for part in parts) == pytest.approx(whole[0], rel=1e-6)
-    for which in (1, 2, 3):
-        together = np.sum([part[which] for part in parts], axis=0)
-        np.testing.assert_allclose(together, whole[which], atol=1e-4 * np.abs(whole[which]).max())
+    at = [a.astype(np.float32) for a in (hinge - data.points.min(axis=0), gamma, 3.0 * weight)]
+    for scale in (1e-3, 1.0, 1e3):
+        scaled = data._replace(count=(scale * data.count).astype(np.float32))
+        problem = _problem(scaled, hinge, gamma, batch=400)
+        exact = [torch.from_numpy(a.astype(float)).requires_grad_() for a in (hinge, gamma, at[2])]
+        _log_likelihood(scaled, *exact).backward()
+        gradient = exact[2].grad.numpy()
+        ours = problem.log_likelihood(*at, np.zeros(400, np.int64))[3]
+        np.testing.assert_allclose(ours, gradient, rtol=2e-3, atol=1e-3 * np.abs(gradient).max())
 
 
 def test_the_penalty_is_the_log_density_of_the_priors() -> None:
@@ -276,7 +296,7 @@ def test_the_weights_divergence_is_that_of_two_normals() -> None:
     )
     prior = torch.distributions.Normal(torch.zeros(20).double(), torch.full((20,), 7.0).double())
     expected = float(torch.distributions.kl_divergence(posterior, prior).sum())
-    weights = WeightPosterior(mean, var, 0, 0, 0.0, True)
+    weights = abhm._Weights(mean, var, True)
     assert abhm._weight_divergence(weights, 49.0) == pytest.approx(expected, rel=1e-6)
 
 
@@ -293,6 +313,15 @@ def test_the_same_seed_gives_the_same_bits_with_any_number_of_threads() -> None:
     for threads in (1, 2, 5):
         assert _equal(first, data.fit(seed=3, threads=threads)), f"{threads} threads"
     assert not _equal(first, data.fit(seed=4))
+
+
+def test_fits_in_threads_of_one_process_do_not_disturb_each_other() -> None:
+    data = _data()
+    alone = [data.fit(seed=seed) for seed in range(6)]
+    with ThreadPoolExecutor(6) as pool:
+        together = list(pool.map(lambda seed: data.fit(seed=seed), range(6)))
+    for one, other in zip(alone, together, strict=True):
+        assert _equal(one, other)
 
 
 def test_nobody_elses_random_numbers_are_touched() -> None:
@@ -335,10 +364,10 @@ def test_every_epoch_is_reported_in_order() -> None:
 
 
 def _features(data: Data, hinge: Float64, gamma: Float64) -> Float64:
-    phi = np.exp(-gamma * np.square(data.points[:, None] - hinge).sum(axis=2))
-    return np.where(phi < CUT, 0.0, phi)
+    return np.exp(-gamma * np.square(data.points[:, None] - hinge).sum(axis=2))
 
 
+@pytest.mark.usefixtures("_no_cut")
 def test_the_objective_falls_and_is_what_it_says() -> None:
     data, seen = _data(), []
     fit = data.fit(sample_weight=data.count, on_epoch=seen.append)
@@ -353,12 +382,13 @@ def test_the_objective_falls_and_is_what_it_says() -> None:
         assert at.objective == pytest.approx((loss + prior) / len(data.points), rel=1e-4)
 
 
+@pytest.mark.usefixtures("_no_cut")
 def test_the_weights_end_at_their_optimum() -> None:
     data = _data()
     fit = data.fit()
     phi = _features(data, fit.hinge_mean, fit.gamma_shape.astype(np.float64) / fit.gamma_rate)
     k = len(data.hinge)
-    dense = fit_dense(phi, data.occupied, np.zeros(k), np.full(k, 200.0), tolerance=1e-14)
+    dense = fit_dense(phi, data.occupied, np.zeros(k), np.full(k, 200.0))
 
     def gradient(w: NDArray[np.floating]) -> Float64:
         return phi.T @ (expit(phi @ w) - data.occupied) + w / 200.0
@@ -472,8 +502,11 @@ def test_learning_that_was_cut_short_says_so() -> None:
     fit = data.fit(patient)
     assert fit.converged
     assert len(fit.objectives) < 31, "it ended because it gained too little"
-    gains = [(a - b) / a for a, b in itertools.pairwise(fit.objectives)]
-    assert max(gains[-3:-1]) < patient.tolerance
+    best = np.minimum.accumulate(fit.objectives[:-1])
+    gains = 1.0 - np.array(fit.objectives[1:-1]) / best[:-1]  # the last one was solved to the end
+    assert 2 <= (gains < patient.tolerance).sum() <= 3, (
+        "noise alone makes smaller steps, it does not end learning"
+    )
 
 
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")
