@@ -62,8 +62,7 @@ class AbhmSettings:
     gamma_shape: float = 2.0  # of gamma's prior, whose mean is the start
     max_epochs: int = 10  # of the means
     dispersion_epochs: int = 4
-    dispersion_steps: int = 30  # gradient steps of the dispersions an epoch
-    steps: int = 60  # gradient steps of the means an epoch
+    steps: int = 60  # gradient steps an epoch
     batch: int = 2_000  # points a step
     learning_rate: float = 0.1  # of hinges (in length scales) and of log gamma; falls along a half cosine
     # an epoch that gains less than this share of the objective makes the steps smaller, the third one ends the means;
@@ -77,7 +76,7 @@ class AbhmSettings:
         for name in ("max_epochs", "dispersion_epochs"):
             if getattr(self, name) < 0:
                 raise ShapeError(f"{name} must be >= 0, got {getattr(self, name)}")
-        for name in ("steps", "dispersion_steps", "batch"):
+        for name in ("steps", "batch"):
             if getattr(self, name) < 1:
                 raise ShapeError(f"{name} must be at least 1, got {getattr(self, name)}")
 
@@ -419,11 +418,11 @@ def _learn_dispersions(
     weight_cost = _weight_divergence(means.weights, settings.weight_var) + _weight_noise(
         means.weights, settings.weight_var
     )
-    total = settings.dispersion_epochs * settings.dispersion_steps
+    total = settings.dispersion_epochs * settings.steps
     for epoch in range(settings.dispersion_epochs):
         elbo = 0.0
-        for step, first in enumerate(itertools.islice(problem.batches(rng), settings.dispersion_steps)):
-            done = (epoch * settings.dispersion_steps + step) / total
+        for step, first in enumerate(itertools.islice(problem.batches(rng), settings.steps)):
+            done = (epoch * settings.steps + step) / total
             optimiser.param_groups[0]["lr"] = _DISPERSION_RATE * _half_cosine(done)
             optimiser.zero_grad()
             q_h = torch.distributions.Normal(shift, log_sd.exp())
@@ -438,7 +437,7 @@ def _learn_dispersions(
             (-bound).backward()
             optimiser.step()
             elbo += float(bound.detach())
-        elbos.append(elbo / settings.dispersion_steps - weight_cost / n)
+        elbos.append(elbo / settings.steps - weight_cost / n)
     with torch.no_grad():
         sd = (log_sd.exp() * length[:, None] * free_axes).double().numpy()
         shape = log_shape.double().exp().numpy()

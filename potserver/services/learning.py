@@ -41,7 +41,6 @@ class LearningSettings:
     gamma_shape: float = 2.0
     max_epochs: int = 10
     dispersion_epochs: int = 4
-    dispersion_steps: int = 30
     steps: int = 60
     batch: int = 2_000
     learning_rate: float = 0.1

@@ -136,7 +136,6 @@ def test_what_cannot_be_learned_is_refused(change: dict, error: type[Exception],
         ("max_epochs", -1),
         ("dispersion_epochs", -1),
         ("steps", 0),
-        ("dispersion_steps", 0),
         ("batch", 0),
     ],
 )

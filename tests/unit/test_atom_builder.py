@@ -75,7 +75,7 @@ def test_a_task_travels_and_its_result_depends_on_it_alone() -> None:
 
 def test_atoms_say_where_they_are_from_and_how_good_they_are() -> None:
     task = first_scan().task
-    for atom, scores, later in first_scan().candidates:
+    for atom, scores, later, content in first_scan().candidates:
         noted = atom.provenance
         assert (noted["source"], noted["licence"], noted["version"]) == ("bundled:plan", "MIT", __version__)
         assert (noted["scan_number"], noted["seed"]) == ("0", "5")
@@ -90,6 +90,7 @@ def test_atoms_say_where_they_are_from_and_how_good_they_are() -> None:
         ):
             assert float(noted[f"held_out_{key}"]) == pytest.approx(value, abs=1e-4)
         assert int(noted["held_out_n"]) == scores.n >= task.quality.min_points
+        assert int(noted["content_nats"]) == round(content)
         assert len(task.later) == 2
         if later is None:
             assert noted["later_scans"] == "0"
@@ -106,7 +107,7 @@ def test_scores_are_those_of_held_out_beams_in_the_sector() -> None:
 
     recorded = bundled.open_bundled("plan")[0]
     _, held_out = HoldOut().split(recorded)
-    for atom, scores, _ in first_scan().candidates:
+    for atom, scores, _, content in first_scan().candidates:
         width = atom.azimuth_width_rad
         turn = rotation_z(yaw_of(recorded.T_map_sensor) + int(atom.provenance["sector"]) * width)
         local = (held_out.points - recorded.T_map_sensor[:3, 3]) @ turn
@@ -115,7 +116,10 @@ def test_scores_are_those_of_held_out_beams_in_the_sector() -> None:
         answer = KernelMap.from_arrays(k.hinge_mean, k.gamma, k.weight_mean, np.zeros(len(k))).occupancy(
             local[inside]
         )
-        assert scores == score(answer.mean, held_out.occupied[inside], answer.observed)
+        truth = held_out.occupied[inside]
+        assert scores == score(answer.mean, truth, answer.observed)
+        constant = score(np.full(len(truth), truth.mean()), truth)
+        assert content == pytest.approx(len(truth) * (constant.nll - scores.nll))
 
 
 def test_no_atom_holds_a_held_out_hit() -> None:

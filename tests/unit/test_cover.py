@@ -34,13 +34,13 @@ def _candidates(n: int = 14) -> tuple[Atom, ...]:
 
 
 @functools.cache
-def _nll(n: int = 14) -> tuple[float, ...]:
-    return tuple(np.random.default_rng(5).uniform(0.1, 0.5, n))
+def _content(n: int = 14) -> tuple[float, ...]:
+    return tuple(np.random.default_rng(5).uniform(100.0, 500.0, n))
 
 
 def test_every_candidate_has_a_chosen_atom_within_the_tolerance() -> None:
     atoms = _candidates()
-    cover = greedy_cover(atoms, _nll(), TOLERANCE_M)
+    cover = greedy_cover(atoms, _content(), TOLERANCE_M)
     assert 1 < len(cover.chosen) < len(atoms)
     for i, (by, distance) in enumerate(zip(cover.covered_by, cover.distance_m, strict=True)):
         assert by in cover.chosen
@@ -51,7 +51,7 @@ def test_every_candidate_has_a_chosen_atom_within_the_tolerance() -> None:
 
 def test_no_chosen_atom_is_near_an_earlier_one() -> None:
     atoms = _candidates()
-    chosen = greedy_cover(atoms, _nll(), TOLERANCE_M).chosen
+    chosen = greedy_cover(atoms, _content(), TOLERANCE_M).chosen
     for position, later in enumerate(chosen):
         for earlier in chosen[:position]:
             assert distances_m(atoms[earlier], [atoms[later]])[0] > TOLERANCE_M
@@ -59,34 +59,51 @@ def test_no_chosen_atom_is_near_an_earlier_one() -> None:
 
 @pytest.mark.parametrize("seed", range(3))
 def test_the_order_of_the_candidates_plays_no_part(seed: int) -> None:
-    atoms, nll = _candidates(), np.array(_nll())
-    expected = greedy_cover(atoms, nll, TOLERANCE_M)
+    atoms, content = _candidates(), np.array(_content())
+    expected = greedy_cover(atoms, content, TOLERANCE_M)
     order = np.random.default_rng(seed).permutation(len(atoms))
-    shuffled = greedy_cover([atoms[i] for i in order], nll[order], TOLERANCE_M)
+    shuffled = greedy_cover([atoms[i] for i in order], content[order], TOLERANCE_M)
     assert [order[i] for i in shuffled.chosen] == expected.chosen
     np.testing.assert_array_equal(order[shuffled.covered_by], expected.covered_by[order])
 
 
-def test_of_two_that_are_alike_the_better_one_is_taken() -> None:
+def test_of_two_that_are_alike_the_one_that_tells_more_is_taken() -> None:
     atoms = _candidates()[:2]
-    assert greedy_cover(atoms, [0.2, 0.3], TOLERANCE_M).chosen == [0]
-    assert greedy_cover(atoms, [0.3, 0.2], TOLERANCE_M).chosen == [1]
-    assert greedy_cover(atoms, [0.30001, 0.3], TOLERANCE_M).chosen == [0], (
-        "the same in four digits: the id decides"
-    )
+    assert greedy_cover(atoms, [300.0, 200.0], TOLERANCE_M).chosen == [0]
+    assert greedy_cover(atoms, [200.0, 300.0], TOLERANCE_M).chosen == [1]
+    assert greedy_cover(atoms, [200.1, 200.4], TOLERANCE_M).chosen == [0], "the same in nats: the id decides"
+
+
+def test_what_tells_little_comes_last_however_far_it_is() -> None:
+    atoms = _candidates()
+    content = np.full(len(atoms), 1_000.0)
+    content[[0, 6]] = [-50.0, 0.0]  # worse than a constant, and no better
+    chosen = greedy_cover(atoms, content, 0.0).chosen
+    assert sorted(chosen) == list(range(len(atoms))), "what is not covered is kept in the end"
+    assert set(chosen[-2:]) == {0, 6}
+
+
+def test_of_what_tells_as_much_the_farthest_is_taken() -> None:
+    atoms = _candidates()
+    chosen = greedy_cover(atoms, np.full(len(atoms), 200.0), TOLERANCE_M).chosen
+    assert chosen[0] == 0
+    to_first = distances_m(atoms[0], atoms)
+    assert to_first[chosen[1]] == to_first.max()
+    least = np.minimum(to_first, distances_m(atoms[chosen[1]], atoms))
+    assert least[chosen[2]] == least.max()
 
 
 def test_a_larger_tolerance_never_keeps_more() -> None:
     counts = [
-        len(greedy_cover(_candidates(), _nll(), tolerance).chosen) for tolerance in (0.0, 0.5, 1.0, 2.0, 99.0)
+        len(greedy_cover(_candidates(), _content(), tolerance).chosen) for tolerance in (0.0, 0.5, 1.0, 2.0, 99.0)
     ]
     assert counts == sorted(counts, reverse=True)
     assert (counts[0], counts[-1]) == (len(_candidates()), 1)
 
 
 def test_a_limit_leaves_the_rest_uncovered() -> None:
-    cover = greedy_cover(_candidates(), _nll(), 0.0, max_atoms=3)
-    whole = greedy_cover(_candidates(), _nll(), 0.0)
+    cover = greedy_cover(_candidates(), _content(), 0.0, max_atoms=3)
+    whole = greedy_cover(_candidates(), _content(), 0.0)
     assert cover.chosen == whole.chosen[:3]
     assert int((cover.covered_by == -1).sum()) == len(_candidates()) - 3
 
@@ -95,7 +112,7 @@ def test_each_group_has_a_limit_of_its_own() -> None:
     group = [i % 2 for i in range(len(_candidates()))]
     calls: list[tuple[int, int]] = []
     cover = greedy_cover(
-        _candidates(), _nll(), 0.0, group=group, max_of_group=[2, None], on_chosen=lambda *n: calls.append(n)
+        _candidates(), _content(), 0.0, group=group, max_of_group=[2, None], on_chosen=lambda *n: calls.append(n)
     )
     chosen_of = [sum(group[i] == g for i in cover.chosen) for g in (0, 1)]
     assert chosen_of == [2, group.count(1)]
@@ -106,8 +123,8 @@ def test_each_group_has_a_limit_of_its_own() -> None:
 def test_an_atom_counts_as_far_in_units_of_its_own_tolerance() -> None:
     coarse, fine = np.full(len(_candidates()), 99.0), np.full(len(_candidates()), 99.0)
     fine[[0, 2, 4]] = 0.1
-    assert len(greedy_cover(_candidates(), _nll(), coarse).chosen) == 1
-    assert {0, 2, 4} <= set(greedy_cover(_candidates(), _nll(), fine).chosen)
+    assert len(greedy_cover(_candidates(), _content(), coarse).chosen) == 1
+    assert {0, 2, 4} <= set(greedy_cover(_candidates(), _content(), fine).chosen)
 
 
 def test_an_atom_is_at_no_distance_from_itself_and_its_turned_copies() -> None:
@@ -136,7 +153,7 @@ def test_nothing_to_choose_from_and_wrong_lengths() -> None:
     with pytest.raises(ShapeError):
         greedy_cover(_candidates(), [0.1], 1.0)
     with pytest.raises(ShapeError):
-        greedy_cover(_candidates(), _nll(), 1.0, group=[0])
+        greedy_cover(_candidates(), _content(), 1.0, group=[0])
 
 
 def _turned(atom: Atom, degrees: float) -> Atom:

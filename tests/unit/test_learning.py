@@ -152,6 +152,14 @@ def test_sectors_share_out_all_labelled_points() -> None:
         assert (np.abs(bearing) <= sector.width_rad / 2 + 1e-6).all()
 
 
+def test_a_negative_seed_is_refused() -> None:
+    points, occupied = np.eye(3), np.array([True, False, True])
+    with pytest.raises(SettingsError, match="seed"):
+        learn_kernels(points, occupied, LearningSettings(), seed=-1)
+    with pytest.raises(SettingsError, match="seed"):
+        learn_atoms(_scan(), "a", LearningSettings(), {}, seed=-1)
+
+
 def test_no_scans_are_refused() -> None:
     with pytest.raises(EmptyError, match="no scans"):
         learn_atoms([], "a", SETTINGS, {})
@@ -288,6 +296,13 @@ def test_a_lattice_over_one_place_is_one_kernel_there(points: np.ndarray) -> Non
     np.testing.assert_array_equal(hinge, points[:1])
     assert np.isfinite(gamma).all()
     assert (gamma > 0).all()
+
+
+@pytest.mark.parametrize("n_kernels", [1, 2, 3, 7])
+def test_a_lattice_never_has_more_kernels_than_wanted(n_kernels: int) -> None:
+    """However they lie about the origin, which is where eight cells meet."""
+    points = np.random.default_rng(0).normal(0.0, 1.0, (200, 3))
+    assert 1 <= len(lattice(points, n_kernels)[0]) <= n_kernels
 
 
 def test_a_line_of_points_gives_kernels_on_the_line() -> None:
