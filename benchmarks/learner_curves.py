@@ -1,8 +1,9 @@
 """How good learned kernels are for their number, against a grid of fixed kernels with jointly solved weights.
 
-    python benchmarks/learner_curves.py town:downtown:5 DATASET... [--scans 0,20] [--window 1] [-o docs/learner.png]
+    python benchmarks/learner_curves.py town:downtown:5 DATASET... [--scans 0,20] [--window 1] [--later 2] [-o docs/learner.png]
 
-Both get the same labels and sample weights of the same sectors, and both are scored on the held-out beams of these sectors.
+Both get the same labels and sample weights of the same sectors, and both are scored on the held-out beams of these sectors,
+and on those beams of later scans that see a sector again.
 The grid is a lattice over the data with a length scale of 0.75 spacings and the learner's own prior. "Favoured" is a grid whose
 prior variance is the best of three by those very held-out beams.
 """
@@ -22,7 +23,7 @@ from rich.progress import track
 from rich.table import Table
 
 from potclient.datasets import Recording, open_dataset
-from potclient.holdout import HoldOut
+from potclient.holdout import HoldOut, LabelledPoints
 from potclient.metrics import Metrics, score
 from potserver.atom_builder.scan_task import SectorOf, to_scan
 from potserver.domain.kernel_map import KernelMap
@@ -40,12 +41,19 @@ class Sector(NamedTuple):
     occupied: np.ndarray
     test_points: np.ndarray
     test_occupied: np.ndarray
+    later_points: np.ndarray
+    later_occupied: np.ndarray
+
+
+class Scores(NamedTuple):
+    own: Metrics  # held-out beams of the scans that were learned
+    later: Metrics | None  # of later ones; None where they show hits alone, free space alone, or nothing
 
 
 def main() -> int:
     options = _options()
     settings = LearningSettings(n_sectors=options.sectors, max_range_m=options.max_range)
-    console = Console(width=120)
+    console = Console(width=160)
     found = {}
     for dataset in options.datasets:
         recording = open_dataset(dataset, max_range_m=options.max_range)
@@ -74,6 +82,7 @@ def _options() -> argparse.Namespace:
     parser.add_argument("datasets", nargs="*", metavar="DATASET")
     parser.add_argument("--scans", default="0,20", help="first scans of the windows [0,20]")
     parser.add_argument("--window", type=int, default=1, help="scans learned together [1]")
+    parser.add_argument("--later", type=int, default=2, help="scans after a window that judge too [2]")
     parser.add_argument("--sectors", type=int, default=6)
     parser.add_argument("--max-range", type=float, default=20.0, metavar="M")
     parser.add_argument(
@@ -92,16 +101,25 @@ def _sectors(recording: Recording, options: argparse.Namespace, settings: Learni
     for first in map(int, options.scans.split(",")):
         numbers = range(first, min(first + options.window, len(recording)))
         parts = [HoldOut().split(recording[number], number) for number in numbers]
+        ends = range(numbers.stop, min(numbers.stop + options.later, len(recording)))
+        after = [HoldOut().split(recording[number], number)[1] for number in ends]
         scans = [to_scan(scan, number) for (scan, _), number in zip(parts, numbers, strict=True)]
         for cut in cut_sectors(scans, settings, np.random.default_rng(first)):
             where = SectorOf(parts[0][0], cut.number, settings)
-            picked = [where.pick(labels) for _, labels in parts]
-            occupied = np.concatenate([p[1] for p in picked])
+            own, later = _picked(where, [labels for _, labels in parts]), _picked(where, after)
+            occupied = own[1]
             if cut.occupied.sum() >= settings.min_hits and occupied.any() and not occupied.all():
-                sectors.append(
-                    Sector(cut.points, cut.occupied, np.concatenate([p[0] for p in picked]), occupied)
-                )
+                sectors.append(Sector(cut.points, cut.occupied, *own, *later))
     return sectors
+
+
+def _picked(where: SectorOf, held_out: list[LabelledPoints]) -> tuple[np.ndarray, np.ndarray]:
+    parts = [where.pick(labels) for labels in held_out]
+    if not parts:
+        return np.zeros((0, 3)), np.zeros(0, bool)
+    return np.concatenate([points for points, _ in parts]), np.concatenate(
+        [occupied for _, occupied in parts]
+    )
 
 
 def _curves(sectors: list[Sector], counts: list[int], settings: LearningSettings) -> dict:
@@ -135,7 +153,7 @@ def _with(settings: LearningSettings, **changes: object) -> dict:
     return {name: getattr(settings, name) for name in settings.__slots__} | changes
 
 
-def _grid(sector: Sector, count: int, settings: LearningSettings) -> tuple[Metrics, Metrics]:
+def _grid(sector: Sector, count: int, settings: LearningSettings) -> tuple[Scores, Scores]:
     points, occupied = sector.points, sector.occupied
     if len(points) > settings.max_labelled:  # the learner draws the same ones
         drawn = np.random.default_rng(0).choice(len(points), settings.max_labelled, replace=False)
@@ -150,16 +168,21 @@ def _grid(sector: Sector, count: int, settings: LearningSettings) -> tuple[Metri
             sample_weight=beam_weights(occupied, settings.free_per_beam), max_newton=30, max_conjugate_gradient=200,
         )  # fmt: skip
         results[prior_var] = _scored(sector, hinge, gamma, solved.mean)
-    return results[settings.weight_var], min(results.values(), key=lambda metrics: metrics.nll)
+    return results[settings.weight_var], min(results.values(), key=lambda scores: scores.own.nll)
 
 
-def _scored(sector: Sector, hinge: np.ndarray, gamma: np.ndarray, weight: np.ndarray) -> Metrics:
-    answer = KernelMap.from_arrays(hinge, gamma, weight, np.zeros(len(weight))).occupancy(sector.test_points)
-    return score(answer.mean, sector.test_occupied)
+def _scored(sector: Sector, hinge: np.ndarray, gamma: np.ndarray, weight: np.ndarray) -> Scores:
+    kernels = KernelMap.from_arrays(hinge, gamma, weight, np.zeros(len(weight)))
+    own = score(kernels.occupancy(sector.test_points).mean, sector.test_occupied)
+    if not sector.later_occupied.any() or sector.later_occupied.all():
+        return Scores(own, None)
+    return Scores(own, score(kernels.occupancy(sector.later_points).mean, sector.later_occupied))
 
 
-def _plain(metrics: Metrics) -> dict[str, float]:
-    return {"auc": metrics.auc, "nll": metrics.nll, "ece": metrics.ece, "accuracy": metrics.accuracy}
+def _plain(scores: Scores) -> dict[str, float]:
+    own, later = scores
+    plain = {"auc": own.auc, "nll": own.nll, "ece": own.ece, "accuracy": own.accuracy}
+    return plain if later is None else plain | {"later_auc": later.auc, "later_nll": later.nll}
 
 
 def _table(curves: dict) -> Table:
@@ -179,6 +202,12 @@ def _table(curves: dict) -> Table:
     table.add_column("NLL", justify="right")
     table.add_column("NLL, favoured", justify="right")
     table.add_column("NLL, twice as many", justify="right")
+    table.add_column("later: grid AUC", justify="right")
+    table.add_column("NLL", justify="right")
+    table.add_column("learned AUC", justify="right")
+    table.add_column("NLL", justify="right")
+    table.add_column("better: AUC", justify="right")
+    table.add_column("NLL", justify="right")
     for count, grid in curves["grid"].items():
         twice = curves["grid"].get(str(2 * int(count)))
         row = [count, *(f"{_mean(grid, key):.4f}" for key in ("auc", "nll", "ece"))]
@@ -189,6 +218,12 @@ def _table(curves: dict) -> Table:
             row += [f"{_share(learned, grid, 'auc'):.0%}", f"{_share(learned, grid, 'nll'):.0%}"]
             row += [f"{_share(learned, curves['favoured'][count], 'nll'):.0%}"]
             row += ["-" if twice is None else f"{_share(learned, twice, 'nll'):.0%}"]
+            fixed, moved = ([r for r in rows if "later_nll" in r] for rows in (grid, learned))
+            if fixed:
+                row += [
+                    f"{_mean(rows, key):.4f}" for rows in (fixed, moved) for key in ("later_auc", "later_nll")
+                ]
+                row += [f"{_share(moved, fixed, key):.0%}" for key in ("later_auc", "later_nll")]
         table.add_row(*row)
     return table
 
@@ -199,7 +234,7 @@ def _mean(rows: list[dict[str, float]], key: str) -> float:
 
 def _share(ours: list[dict[str, float]], theirs: list[dict[str, float]], key: str) -> float:
     """Of sectors in which ours is at least as good."""
-    sign = 1.0 if key == "auc" else -1.0
+    sign = 1.0 if key.endswith("auc") else -1.0
     return float(np.mean([sign * a[key] >= sign * b[key] for a, b in zip(ours, theirs, strict=True)]))
 
 

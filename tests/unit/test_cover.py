@@ -95,7 +95,8 @@ def test_of_what_tells_as_much_the_farthest_is_taken() -> None:
 
 def test_a_larger_tolerance_never_keeps_more() -> None:
     counts = [
-        len(greedy_cover(_candidates(), _content(), tolerance).chosen) for tolerance in (0.0, 0.5, 1.0, 2.0, 99.0)
+        len(greedy_cover(_candidates(), _content(), tolerance).chosen)
+        for tolerance in (0.0, 0.5, 1.0, 2.0, 99.0)
     ]
     assert counts == sorted(counts, reverse=True)
     assert (counts[0], counts[-1]) == (len(_candidates()), 1)
@@ -112,7 +113,12 @@ def test_each_group_has_a_limit_of_its_own() -> None:
     group = [i % 2 for i in range(len(_candidates()))]
     calls: list[tuple[int, int]] = []
     cover = greedy_cover(
-        _candidates(), _content(), 0.0, group=group, max_of_group=[2, None], on_chosen=lambda *n: calls.append(n)
+        _candidates(),
+        _content(),
+        0.0,
+        group=group,
+        max_of_group=[2, None],
+        on_chosen=lambda *n: calls.append(n),
     )
     chosen_of = [sum(group[i] == g for i in cover.chosen) for g in (0, 1)]
     assert chosen_of == [2, group.count(1)]
