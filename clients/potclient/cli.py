@@ -978,9 +978,9 @@ A change counts for all maps of the server, from their next scan on. The server 
 already, and says why. A file holds one atom; `potserver atoms export` takes them out of a dictionary.""",
         epilog="""examples:
   potclient atoms
-  potclient atoms get terraces-90-s2 -o terraces-90-s2.atom
-  potclient atoms add terraces-90-s2.atom corner.atom
-  potclient atoms remove terraces-90-s2""",
+  potclient atoms get terraces-180-s4 -o terraces-180-s4.atom
+  potclient atoms add terraces-180-s4.atom corner.atom
+  potclient atoms remove terraces-180-s4""",
     )
     parser.add_argument(
         "verb", nargs="?", choices=("list", "get", "add", "remove"), default="list", help="default: list"
