@@ -777,7 +777,7 @@ def encode_tiles_part(plan: TilesPlan, part: int) -> Wire:
             map_revision=plan.map_revision,
             whole=plan.is_whole,
             tile_size_m=float(plan.tile_size_m),
-            tiles=wire.pack_array(np.vstack([run.index.T, run.revision])),
+            tiles=wire.pack_array(np.vstack([run.indices.T, run.revisions])),
             counts=wire.pack_array(run.counts),
             gone=wire.pack_array(plan.gone.T) if part == 0 and len(plan.gone) else None,
             kernels=code_kernels(run.kernels, plan.spacings_m),

@@ -447,10 +447,10 @@ class QueryService:
             TooLargeError: too many known tiles.
         """
         if known is not None:
-            n = len(known.index)
-            if known.index.shape != (n, 3) or known.revision.shape != (n,):
+            n = len(known.indices)
+            if known.indices.shape != (n, 3) or known.revisions.shape != (n,):
                 raise ShapeError(
-                    f"known tiles: {known.index.shape} and {known.revision.shape}, need (N, 3) and (N,)"
+                    f"known tiles: {known.indices.shape} and {known.revisions.shape}, need (N, 3) and (N,)"
                 )
             if n > self.max_known_tiles:
                 raise TooLargeError(f"{n} known tiles, the limit is {self.max_known_tiles}; ask about a box")

@@ -8,9 +8,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from potserver.domain.map_state import MapState
 from potserver.domain.tiles import Tile, TileIndex
 from potserver.domain.types import AnswerRule, Float32, Float64, KernelSet
-from potserver.services.mapping import MapState
 
 Int64 = NDArray[np.int64]
 
@@ -21,15 +21,15 @@ class KnownTiles(NamedTuple):
     """What an asker has of a map."""
 
     epoch: int  # of the map that the revisions are of
-    index: Int64  # (N, 3)
-    revision: Int64  # (N,)
+    indices: Int64  # (N, 3)
+    revisions: Int64  # (N,)
 
 
 class TileRun(NamedTuple):
     """Some tiles, or parts of them, one after the other."""
 
-    index: Int64  # (T, 3)
-    revision: Int64  # (T,)
+    indices: Int64  # (T, 3)
+    revisions: Int64  # (T,)
     counts: Int64  # (T,) kernels of each, at least 1
     kernels: KernelSet  # relative to the lower corners of their tiles
 
@@ -117,16 +117,16 @@ def plan_tiles(
     is_whole = known is None or known.epoch != state.epoch
     revisions: dict[TileIndex, int] = {}
     if known is not None and not is_whole:
-        meant = _inside(known.index, low, high)
+        meant = _inside(known.indices, low, high)
         revisions = {
             (x, y, z): revision
             for (x, y, z), revision in zip(
-                known.index[meant].tolist(), known.revision[meant].tolist(), strict=True
+                known.indices[meant].tolist(), known.revisions[meant].tolist(), strict=True
             )
         }
     return TilesPlan(
         epoch=state.epoch,
-        map_revision=state.snapshot.map_revision,
+        map_revision=state.map_revision,
         rule=state.snapshot.rule,
         tile_size_m=size,
         spacings_m=() if state.tiled is None else (state.tiled.grid.coarse_m, state.tiled.grid.fine_m),
@@ -139,9 +139,9 @@ def plan_tiles(
 
 
 def rounded(values: Float32, bits: int) -> Float32:
-    """Float32 numbers with their mantissas rounded to 2 to 22 bits, half up: off by at most 2^-(bits + 1) of themselves.
+    """Float32 numbers with mantissas of 2 to 22 bits, the nearest ones: off by at most 2^-(bits + 1) of themselves.
 
-    Numbers beyond the largest that is left keep their size: nothing becomes infinite. Below 1e-38 the bound is 2^-(bits + 1) of that.
+    Nothing becomes infinite: what would is cut off instead. Below 2^-126 numbers are off by at most 2^-(bits + 127).
     """
     dropped = MANTISSA_BITS - bits
     keep = np.uint32((0xFFFFFFFF << dropped) & 0xFFFFFFFF)

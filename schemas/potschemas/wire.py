@@ -34,7 +34,9 @@ MAX_DEPTH = (
 MAX_ITEMS = 100_000  # entries of one map or list; arrays are bytes, so real messages stay far below
 MAX_VALUES = 100_000  # values and keys in all; a revision tick of 24,000 tiles fits
 MAX_STRING_BYTES = 65_536
-_DEFLATE_LEVEL = 6  # 1 is a few ms faster on a large answer, 9 twice as slow; neither changes the size by more than 3 %
+_DEFLATE_LEVEL = (
+    6  # 1 is a few ms faster on a large answer, 9 twice as slow; neither changes the size by more than 3 %
+)
 _MAX_ERROR_CHARS = 300  # a hostile sender must not fill our log through an error text
 _UNSAID = ("", "zenoh/bytes", MIME)  # Zenoh's default, and ours without a schema
 
@@ -173,7 +175,9 @@ def pack_array(array: NDArray[Any]) -> Packed:
     """
     dtype, little = _little_endian(array)
     planes = little.reshape(-1).view(np.uint8).reshape(-1, little.itemsize).T
-    return Packed(dtype=dtype, shape=list(array.shape), deflated=zlib.compress(planes.tobytes(), _DEFLATE_LEVEL))
+    return Packed(
+        dtype=dtype, shape=list(array.shape), deflated=zlib.compress(planes.tobytes(), _DEFLATE_LEVEL)
+    )
 
 
 def unpack_array(
