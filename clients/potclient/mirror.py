@@ -264,9 +264,12 @@ def _tiles_of(part: TilesPart) -> Iterator[tuple[TileIndex, _Tile]]:
     if (counts < 1).any() or (counts > k).any() or counts.sum() != k:
         raise BadReplyError(f"tiles: the counts of part {part.part} are not those of {k} kernels")
     kernels = _decode(part.kernels, k)
-    corners = np.repeat(tiles[:3].T * part.tile_size_m, counts, axis=0)
+    with np.errstate(over="ignore", invalid="ignore"):
+        hinge = kernels.hinge_mean + np.repeat(tiles[:3].T * part.tile_size_m, counts, axis=0)
+    kernels = kernels._replace(hinge_mean=hinge)
+    if not all(np.isfinite(getattr(kernels, name)).all() for name in _ARRAYS):
+        raise BadReplyError("tiles: kernels with numbers that are not finite")
     ends = np.cumsum(counts)
-    kernels = kernels._replace(hinge_mean=kernels.hinge_mean + corners)
     for (x, y, z, revision), stop, count in zip(tiles.T.tolist(), ends, counts, strict=True):
         run = slice(stop - count, stop)
         # copies: a view would keep the whole part alive
