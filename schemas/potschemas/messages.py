@@ -369,10 +369,8 @@ class TilesQuery(Message, frozen=True, kw_only=True):
 
     schema: ClassVar[str] = "pot.tiles_query.v1"
 
-    lower: Vector3 | None = (
-        None  # m, map frame; tiles that the box touches are meant; absent = no bound on this side
-    )
-    upper: Vector3 | None = None  # m, map frame
+    lower: Vector3 | None = None  # m, map frame; of a box: the tiles that it touches are meant
+    upper: Vector3 | None = None  # m, map frame; an absent corner is no bound on its side
     epoch: Count | None = None  # that `known` is of, from an earlier reply; absent = nothing is known
     known: Packed | None = None  # (4, N) int64: index x, y, z and revision of each tile that the asker has
     mantissa_bits: MantissaBits | None = None  # of each weight to send, rounded; absent = 23, which is all
@@ -386,12 +384,8 @@ class CodedKernels(msgspec.Struct, frozen=True, kw_only=True):
     """
 
     kinds: Packed  # (5, U) float32: hinge_var along x, y, z, m^2; gamma_shape; gamma_rate, m^2
-    lattices: (
-        Packed  # (4, U) float64, m: spacing of each kind, and offset along x, y, z; spacing 0 = no lattice
-    )
-    kind: Packed | None = (
-        None  # (K,) uint8 or int64, which kind each kernel is of; absent = U is K, each its own
-    )
+    lattices: Packed  # (4, U) float64, m: spacing of each kind, 0 = none; offset along x, y, z
+    kind: Packed | None = None  # (K,) uint8 or int64, which kind each is of; absent = each its own, U is K
     cells: Packed  # (3, L) uint8 or int64: of the L kernels whose kinds have a spacing, in order
     hinge_mean: Packed  # (3, K - L) float32, m: of the others, in order
     weight_mean: Packed  # (K,) float32, log-odds
@@ -405,15 +399,13 @@ class TilesPart(Message, frozen=True, kw_only=True):
 
     part: Count  # 0 .. n_parts - 1; parts may arrive in any order
     n_parts: PositiveCount  # how many parts the whole reply has
-    epoch: Count  # drawn anew when a map is created, cleared or loaded: revisions of two epochs say nothing of each other
+    epoch: Count  # drawn anew when a map is created, cleared or loaded; only revisions of one can be compared
     map_revision: Count  # the same in all parts
     whole: bool  # the epoch is not the asker's: these are all tiles of the box, what it had is void
     tile_size_m: Positive  # m, edge of a tile; its lower corner is index * tile_size_m
     tiles: Packed  # (4, T) int64: index x, y, z and revision of each tile that differs
     counts: Packed  # (T,) int64, kernels of each tile in this part, at least 1
-    gone: Packed | None = (
-        None  # (3, G) int64, indices of tiles that the asker has and the map has not; in part 0
-    )
+    gone: Packed | None = None  # (3, G) int64, indices of tiles known to the asker and not there; in part 0
     kernels: CodedKernels  # of the tiles one after the other
     observed_activation: Finite  # summed activation below which a point is unobserved
     prior_var: Finite  # log-odds^2, of the latent where nothing was observed
