@@ -30,6 +30,7 @@ from potclient.errors import (
     QueryTimeoutError,
     UsageError,
 )
+from potclient.files import save_npz
 from potclient.holdout import HoldOut
 from potclient.session import DEFAULT_ENDPOINT, add_zenoh_arguments, options_from_arguments
 from potschemas import __version__, messages
@@ -301,14 +302,12 @@ def _query(arguments: argparse.Namespace) -> int:
     names = ["mean", "var", "latent_mean", "latent_var", "observed"]
     names += ["gradient", "latent_gradient"] if arguments.gradient else []
     if arguments.out is not None:
-        with arguments.out.open("wb") as file:
-            np.savez_compressed(
-                file,
-                allow_pickle=False,
-                points=points,
-                revision=np.int64(answer.revision),
-                **{name: getattr(answer, name) for name in names},
-            )
+        save_npz(
+            arguments.out,
+            points=points,
+            revision=np.int64(answer.revision),
+            **{name: getattr(answer, name) for name in names},
+        )
     _write_json(
         arguments.json,
         {
@@ -501,16 +500,14 @@ def _rays(arguments: argparse.Namespace) -> int:
         )
     }
     if arguments.out is not None:
-        with arguments.out.open("wb") as file:
-            np.savez_compressed(
-                file,
-                allow_pickle=False,
-                origins=origins,
-                directions=directions,
-                quantiles=np.asarray(answer.quantiles),
-                revision=np.int64(answer.revision),
-                **arrays,
-            )
+        save_npz(
+            arguments.out,
+            origins=origins,
+            directions=directions,
+            quantiles=np.asarray(answer.quantiles),
+            revision=np.int64(answer.revision),
+            **arrays,
+        )
     _write_json(
         arguments.json,
         {
