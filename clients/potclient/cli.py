@@ -785,8 +785,8 @@ def _add_mirror(commands: Any) -> None:
         description="""Fetch the map's kernels, then only the tiles that change, and print a line an update. Follows the map
 until interrupted, or --seconds or --updates are over. When the server was restarted or the map cleared, all comes anew.
 
---mantissa-bits rounds the weights, which are most of the bytes. With 10 bits a probability near the surfaces changes by some
-thousandths, and updates are a third shorter.""",
+--mantissa-bits rounds the weights, which are most of the bytes: with 7 bits an update takes half of them and probabilities
+move by up to a hundredth, with 10 bits two thirds and a thousandth.""",
         epilog="""examples:
   potclient mirror                               follow the whole map
   potclient mirror --once -o map.npz             the map as it is now; `potclient.KernelSet.load` reads it
