@@ -24,6 +24,7 @@ from typing import Any
 import msgspec
 
 from potschemas import keys
+from potschemas.messages import MAX_PART_KERNELS
 from potserver.adapters.limits import Limits
 from potserver.adapters.session import ZenohSettings
 from potserver.errors import SettingsError
@@ -59,6 +60,7 @@ class QuerySettings:
     retry_after_s: float = 0.2
     grid_part_cells: int = 65_536
     params_part_kernels: int = 20_000
+    tiles_part_kernels: int = 20_000
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -332,6 +334,11 @@ def _check(s: Settings) -> None:
         "queries.max_queued_bytes",
         s.queries.max_queued_bytes >= s.limits.max_query_bytes,
         "at least limits.max_query_bytes",
+    )
+    need(
+        "queries.tiles_part_kernels",
+        s.queries.tiles_part_kernels <= MAX_PART_KERNELS,
+        f"at most {MAX_PART_KERNELS}, which is all that askers take",
     )
 
 

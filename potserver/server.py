@@ -349,6 +349,7 @@ class _MapNode:
                 limits=s.limits,
                 grid_part_cells=s.queries.grid_part_cells,
                 params_part_kernels=s.queries.params_part_kernels,
+                tiles_part_kernels=s.queries.tiles_part_kernels,
                 encode_info=encode_info,
             ),
             ControlQueryable(
@@ -475,6 +476,7 @@ def _default_maps(settings: Settings) -> MakeMap:
             max_rays=settings.limits.max_query_rays,
             max_poses=settings.limits.max_query_poses,
             max_spheres=settings.limits.max_query_spheres,
+            max_known_tiles=settings.limits.max_query_tiles,
             max_coordinate_m=settings.limits.max_coordinate_m,
         )
         return mapping, asker

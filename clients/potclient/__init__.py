@@ -40,6 +40,7 @@ from potclient.errors import (
     UsageError,
 )
 from potclient.kernels import KernelSet
+from potclient.mirror import MapMirror, MirrorUpdate
 from potclient.results import FeedCounts, Grid, Occupancy, Rays, Receipt, Risk, TransportedParams
 from potclient.session import SessionOptions
 from potschemas import __version__
@@ -62,7 +63,9 @@ __all__ = [
     "KernelSet",
     "LostReplyError",
     "MapClient",
+    "MapMirror",
     "MapServerError",
+    "MirrorUpdate",
     "NoPoseError",
     "NoServerError",
     "Occupancy",

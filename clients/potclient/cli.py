@@ -1,13 +1,15 @@
-"""`potclient publish | query | grid | rays | risk | export | watch | load | info | atoms | control | town`."""
+"""`potclient publish | query | grid | rays | risk | export | mirror | watch | load | info | atoms | control | town`."""
 
 from __future__ import annotations
 
 import argparse
 import contextlib
+import dataclasses
 import json
 import math
 import os
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -19,7 +21,16 @@ import numpy as np
 from potclient.atoms import Atom
 from potclient.client import MapClient
 from potclient.datasets import FORMATS, FRAMES, Recording, open_dataset
-from potclient.errors import DatasetError, MapServerError, PotclientError, UsageError
+from potclient.errors import (
+    DatasetError,
+    LostReplyError,
+    MapServerError,
+    NoServerError,
+    PotclientError,
+    QueryTimeoutError,
+    UsageError,
+)
+from potclient.files import save_npz
 from potclient.holdout import HoldOut
 from potclient.session import DEFAULT_ENDPOINT, add_zenoh_arguments, options_from_arguments
 from potschemas import __version__, messages
@@ -28,8 +39,12 @@ from potschemas.keys import DEFAULT_ROOT
 if TYPE_CHECKING:
     from potclient.loadtest import LoadReport
     from potclient.metrics import Metrics
+    from potclient.mirror import MapMirror, MirrorUpdate
     from potclient.play import PlayReport, ScanOutcome
 
+_POLL_S = (
+    2.0  # `mirror` asks so often even if nothing was announced: a server that was restarted announces nothing
+)
 EXIT_OK, EXIT_FAILED, EXIT_USAGE, EXIT_INTERRUPTED = 0, 1, 2, 130
 
 
@@ -66,6 +81,7 @@ def build_parser() -> argparse.ArgumentParser:
   potclient grid --resolution 0.2 -o map.npz      the whole map as a grid
   potclient rays 0 0 1 --max-range 20             how far one can see from there, all around
   potclient export bt -o map.bt --resolution 0.2  the map for programs that read OctoMap files
+  potclient mirror                                follow the map by what changes
   potclient load --robots 8 --planners 4          how much the server takes
 
 `potclient COMMAND --help` explains each command.""",
@@ -79,6 +95,7 @@ def build_parser() -> argparse.ArgumentParser:
     _add_rays(commands)
     _add_risk(commands)
     _add_export(commands)
+    _add_mirror(commands)
     _add_watch(commands)
     _add_load(commands)
     _add_info(commands)
@@ -285,14 +302,12 @@ def _query(arguments: argparse.Namespace) -> int:
     names = ["mean", "var", "latent_mean", "latent_var", "observed"]
     names += ["gradient", "latent_gradient"] if arguments.gradient else []
     if arguments.out is not None:
-        with arguments.out.open("wb") as file:
-            np.savez_compressed(
-                file,
-                allow_pickle=False,
-                points=points,
-                revision=np.int64(answer.revision),
-                **{name: getattr(answer, name) for name in names},
-            )
+        save_npz(
+            arguments.out,
+            points=points,
+            revision=np.int64(answer.revision),
+            **{name: getattr(answer, name) for name in names},
+        )
     _write_json(
         arguments.json,
         {
@@ -363,10 +378,7 @@ def _add_grid(commands: Any) -> None:
   potclient grid --lower -10 -10 -1 --upper 10 10 3 --resolution 0.2 -o map.npz --png map.png
   potclient grid --lower -10 -10 0.9 --upper 10 10 1.1 --resolution 0.2 --png slice.png""",
     )
-    parser.add_argument(
-        "--lower", type=float, nargs=3, metavar=("X", "Y", "Z"), help="corner of the box, m, map frame"
-    )
-    parser.add_argument("--upper", type=float, nargs=3, metavar=("X", "Y", "Z"))
+    _add_box_arguments(parser, "corner of the box, m, map frame")
     parser.add_argument("--resolution", type=_positive, required=True, metavar="METRES", help="cell edge")
     parser.add_argument(
         "-o", "--out", type=Path, metavar="FILE", help="write an .npz: mean, var, ..., lower, resolution"
@@ -488,16 +500,14 @@ def _rays(arguments: argparse.Namespace) -> int:
         )
     }
     if arguments.out is not None:
-        with arguments.out.open("wb") as file:
-            np.savez_compressed(
-                file,
-                allow_pickle=False,
-                origins=origins,
-                directions=directions,
-                quantiles=np.asarray(answer.quantiles),
-                revision=np.int64(answer.revision),
-                **arrays,
-            )
+        save_npz(
+            arguments.out,
+            origins=origins,
+            directions=directions,
+            quantiles=np.asarray(answer.quantiles),
+            revision=np.int64(answer.revision),
+            **arrays,
+        )
     _write_json(
         arguments.json,
         {
@@ -688,10 +698,7 @@ For pgm, --band says which heights matter to the robot; a map without height nee
     )
     parser.add_argument("kind", choices=("ply", "npz", "pgm", "bt"))
     parser.add_argument("-o", "--out", type=Path, required=True, metavar="FILE", help="file to write")
-    parser.add_argument(
-        "--lower", type=float, nargs=3, metavar=("X", "Y", "Z"), help="corner of the box (default: the map's)"
-    )
-    parser.add_argument("--upper", type=float, nargs=3, metavar=("X", "Y", "Z"))
+    _add_box_arguments(parser, "corner of the box (default: the map's)")
     parser.add_argument("--resolution", type=_positive, metavar="METRES", help="pgm, bt: cell edge")
     parser.add_argument(
         "--band", type=float, nargs=2, metavar=("LOW", "HIGH"), help="pgm: heights that count, m"
@@ -764,6 +771,99 @@ def _part_bar(quiet: bool) -> Iterator[Callable[[int, int], None] | None]:
     bar, task = progress
     with bar:
         yield lambda done, total: bar.update(task, completed=done, total=total)
+
+
+# --- mirror --------------------------------------------------------------------------------------------------------
+
+
+def _add_mirror(commands: Any) -> None:
+    parser = _command(
+        commands,
+        "mirror",
+        _mirror,
+        help="keep a copy of the map, by what changes",
+        description="""Fetch the map's kernels, then only the tiles that change, and print a line an update. Follows the map
+until interrupted, or --seconds or --updates are over. When the server was restarted or the map cleared, all comes anew.
+
+--mantissa-bits rounds the weights, which are most of the bytes: with 7 bits an update takes half of them and probabilities
+move by up to a hundredth, with 10 bits two thirds and a thousandth.""",
+        epilog="""examples:
+  potclient mirror                               follow the whole map
+  potclient mirror --once -o map.npz             the map as it is now; `potclient.KernelSet.load` reads it
+  potclient mirror --lower -10 -10 -1 --upper 10 10 3 --json""",
+    )
+    _add_box_arguments(parser, "corner of the box to follow, m, map frame (default: all of the map)")
+    parser.add_argument(
+        "--mantissa-bits", type=int, metavar="N", help="of the weights, 2 to 23 (default: all)"
+    )
+    parser.add_argument("--once", action="store_true", help="fetch it once and stop")
+    parser.add_argument(
+        "--seconds", type=_positive, metavar="S", help="stop after S seconds (default: never)"
+    )
+    parser.add_argument("--updates", type=int, metavar="N", help="stop after N updates")
+    parser.add_argument("--json", action="store_true", help="one JSON object a line")
+    parser.add_argument(
+        "-o", "--out", type=Path, metavar="FILE", help="at the end, save the kernels as an .npz"
+    )
+
+
+def _mirror(arguments: argparse.Namespace) -> int:
+    if arguments.updates is not None and arguments.updates < 1:
+        raise UsageError("--updates must be 1 or more")
+    n_updates = 1 if arguments.once else arguments.updates
+    until = None if arguments.seconds is None else time.monotonic() + arguments.seconds
+    changed = threading.Event()
+    with _client(arguments) as client:
+        mirror = client.mirror(arguments.lower, arguments.upper, mantissa_bits=arguments.mantissa_bits)
+        client.watch_revisions(lambda _: changed.set())
+        try:
+            for n, (update, took_s) in enumerate(_updates(mirror, changed, until), 1):
+                _say_update(mirror, update, took_s, as_json=arguments.json)
+                if n == n_updates:
+                    break
+        finally:  # when interrupted too
+            if arguments.out is not None and mirror.revision is not None:
+                mirror.kernels.save(arguments.out)
+                _note(f"wrote {arguments.out}: {len(mirror.kernels)} kernels, revision {mirror.revision}")
+    return EXIT_OK
+
+
+def _updates(
+    mirror: MapMirror, changed: threading.Event, until: float | None
+) -> Iterator[tuple[MirrorUpdate, float]]:
+    """The first update, then each that brings something, and the seconds it took; until the monotonic clock says `until`."""
+    is_first = True
+    while True:
+        changed.clear()  # before the question: what changes after it is seen in the next
+        started = time.monotonic()
+        try:
+            update = mirror.update()
+        except (NoServerError, LostReplyError, QueryTimeoutError) as error:
+            if is_first:
+                raise
+            _note(f"{error}; trying again")
+        else:
+            if is_first or not update.is_empty:
+                yield update, time.monotonic() - started
+            is_first = False
+        left = _POLL_S if until is None else min(_POLL_S, until - time.monotonic())
+        if left <= 0:
+            return
+        changed.wait(left)
+
+
+def _say_update(mirror: MapMirror, update: MirrorUpdate, took_s: float, *, as_json: bool) -> None:
+    held_tiles, held_kernels = mirror.n_tiles, len(mirror.kernels)
+    if as_json:
+        took = {"held_tiles": held_tiles, "held_kernels": held_kernels, "ms": round(took_s * 1e3, 1)}
+        _say(json.dumps(dataclasses.asdict(update) | took))
+        return
+    anew = ", all anew" if update.is_whole else ""
+    _say(
+        f"{time.strftime('%H:%M:%S')}  revision {update.revision}{anew}: {update.n_tiles} tiles and {update.n_kernels} kernels"
+        f" came in {update.n_bytes} bytes, {update.n_removed} tiles gone, {took_s * 1e3:.0f} ms; {held_kernels} kernels in"
+        f" {held_tiles} tiles"
+    )
 
 
 # --- watch ---------------------------------------------------------------------------------------------------------
@@ -853,6 +953,7 @@ and rejected by the server with a reason + unknown. Robots drop what the server 
 exit status is 1 if a cloud has no known fate, or a question failed for another reason than overload.""",
         epilog="""examples:
   potclient load --robots 4 --hz 5 --planners 2 --seconds 10
+  potclient mirror                                follow the map by what changes
   potclient load --robots 8 --dataset town:downtown:dynamic
   potclient load --robots 32 --hz 10 --points 20000 --dataset kitti/00 --json load.json""",
     )
@@ -1176,6 +1277,11 @@ def _add_json_argument(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--json", metavar="FILE", help="write everything as JSON; - is stdout, instead of text"
     )
+
+
+def _add_box_arguments(parser: argparse.ArgumentParser, text: str) -> None:
+    parser.add_argument("--lower", type=float, nargs=3, metavar=("X", "Y", "Z"), help=text)
+    parser.add_argument("--upper", type=float, nargs=3, metavar=("X", "Y", "Z"))
 
 
 def _add_recording_arguments(parser: argparse.ArgumentParser, name: str) -> None:

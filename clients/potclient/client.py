@@ -42,6 +42,7 @@ from potclient.errors import (
 )
 from potclient.feed import Feed, Numbering
 from potclient.kernels import KernelSet
+from potclient.mirror import MapMirror
 from potclient.results import (
     FeedCounts,
     Float32,
@@ -69,6 +70,7 @@ _CHUNK_POINTS = 100_000  # points a query at most, whatever the server would tak
 _SPLIT_ABOVE = 20_000  # up to here one query is sent without asking for the server's limits
 _CHUNK_RAYS = 20_000  # rays a query at most
 _CHUNKS_IN_FLIGHT = 4
+_MIRROR_MARGIN_M = 4.0  # kernels of the coarsest maps are 1 m apart, and say nothing any more at 2.5 m
 _CHUNK_RETRIES = 8
 _DIAGNOSIS_TIMEOUT_S = 0.5
 # megabytes, that must not delay short questions and answers on the same link
@@ -76,6 +78,7 @@ _BULK_LANES = {
     "integrate": zenoh.Priority.DATA_LOW,
     "grid": zenoh.Priority.DATA,
     "params": zenoh.Priority.DATA,
+    "tiles": zenoh.Priority.DATA,
 }
 
 _open_clients: weakref.WeakSet[MapClient] = weakref.WeakSet()
@@ -778,6 +781,50 @@ class MapClient:
             )
         _check_parts("params", seen, totals, revisions)
 
+    def mirror(
+        self,
+        lower: ArrayLike | None = None,
+        upper: ArrayLike | None = None,
+        *,
+        margin_m: float = _MIRROR_MARGIN_M,
+        mantissa_bits: int | None = None,
+        timeout_s: float | None = None,
+    ) -> MapMirror:
+        """A copy of the map, or of a box of it, to ask without the server; its `update` fetches the tiles that changed.
+
+        Nothing is sent before the first `update`. The mirror outlives restarts of the server: its next `update` fetches all
+        anew. Close to the edge of a box, kernels beyond it matter too: so the box is widened.
+
+        Args:
+            lower, upper: (3,) m, map frame: corners of the box; None = the whole map.
+            margin_m: By which a box is widened. Kernels carried from atoms may reach farther than the default.
+            mantissa_bits: Round the weights to 2 to 23 bits to save bytes; None = as they are. With b bits each weight is off
+                by at most 2^-(b + 1) of itself, the latent mean by that share of sum_m |weight_mean_m| phi_m.
+            timeout_s: Of one update; None takes the client's.
+        Raises:
+            UsageError: an illegal box, margin or number of bits.
+        """
+        if (lower is None) != (upper is None):
+            raise UsageError("mirror: give both corners, or neither for the whole map")
+        if not (math.isfinite(margin_m) and margin_m >= 0):
+            raise UsageError(f"margin_m is {margin_m}, need 0 or a positive number of metres")
+        if mantissa_bits is not None and not 2 <= mantissa_bits <= 23:
+            raise UsageError(f"mantissa_bits is {mantissa_bits}, need 2 to 23")
+        box = {}
+        if lower is not None and upper is not None:
+            low, high = _corner(lower, "lower"), _corner(upper, "upper")
+            if (high < low).any():
+                raise UsageError(f"mirror: lower {low.tolist()} must not be above upper {high.tolist()}")
+            box = {"lower": (low - margin_m).tolist(), "upper": (high + margin_m).tolist()}
+        wait_s = self._timeout_s if timeout_s is None else timeout_s
+
+        def ask(query: messages.TilesQuery) -> Iterator[tuple[messages.TilesPart, int]]:
+            query = msgspec.structs.replace(query, deadline_ms=wait_s * 1e3)
+            for sample in self._ask("tiles", query, wait_s):
+                yield _decode(sample.payload, messages.TilesPart), len(sample.payload)
+
+        return MapMirror(ask, **box, mantissa_bits=mantissa_bits)
+
     def atoms(self, *, timeout_s: float | None = None) -> list[messages.AtomInfo]:
         """The server's dictionary, one line an atom."""
         return self._ask_one("atoms", messages.AtomsQuery(), messages.AtomList, timeout_s).atoms
@@ -1063,7 +1110,8 @@ def _check_parts(what: str, parts: set[int], totals: set[int], revisions: set[in
         raise IncompleteReplyError(
             f"{what}: parts of revisions {sorted(revisions)}; do two servers serve this map?"
         )
-    if len(totals) != 1 or parts != set(range(next(iter(totals)))):
+    # the length first: whoever claims 2^62 parts must not have them counted
+    if len(totals) != 1 or len(parts) != max(totals) or max(parts) >= len(parts):
         raise IncompleteReplyError(f"{what}: {len(parts)} of {max(totals)} parts came")
 
 

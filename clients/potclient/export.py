@@ -5,17 +5,17 @@ Everything comes from `q/params` and `q/grid`, part by part, so that a map may b
 
 from __future__ import annotations
 
-import contextlib
 import math
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import IO, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from potclient.client import MapClient
 from potclient.errors import UsageError
+from potclient.files import whole
 from potclient.kernels import KernelSet
 from potclient.octomap import KEY_ORIGIN, OcTreeBuilder, write_bt
 from potclient.results import Float64, Grid
@@ -110,7 +110,7 @@ def export_ply(
     """
     n, revisions, done = 0, set(), 0
     scalars = ""
-    with _whole(path) as file:
+    with whole(path) as file:
         file.write(b" " * _PLY_HEADER_BYTES)  # how many there are is known at the end
         for _, n_parts, kernels in client.params_parts(lower, upper):
             file.write(_ply_rows(kernels).tobytes())
@@ -196,7 +196,7 @@ def export_pgm(
     pixels = np.full((nx, ny), _UNKNOWN_PIXEL, np.uint8)
     pixels[(likeliest >= 0) & (likeliest < free_below)] = _FREE_PIXEL
     pixels[likeliest >= occupied_above] = _OCCUPIED_PIXEL
-    with _whole(path) as file:
+    with whole(path) as file:
         file.write(f"P5\n{nx} {ny}\n255\n".encode())
         file.write(np.ascontiguousarray(pixels.T[::-1]).tobytes())
     x_m, y_m = (float(box.first[a]) * box.resolution for a in (0, 1))
@@ -204,7 +204,7 @@ def export_pgm(
         f"image: {path.name}\nmode: trinary\nresolution: {box.resolution:.9g}\norigin: [{x_m:.9g}, {y_m:.9g}, 0.0]\n"
         f"negate: 0\noccupied_thresh: {_NAV2_OCCUPIED}\nfree_thresh: {_NAV2_FREE}\n"
     )
-    with _whole(path.with_suffix(".yaml")) as file:
+    with whole(path.with_suffix(".yaml")) as file:
         file.write(text.encode())
     return Exported(nx * ny, tuple(sorted(revisions)))
 
@@ -278,18 +278,6 @@ def _check_thresholds(occupied_above: float, free_below: float) -> None:
         raise UsageError(
             f"thresholds: occupied above {occupied_above:g}, free below {free_below:g}; need 0 < free <= occupied < 1"
         )
-
-
-@contextlib.contextmanager
-def _whole(path: Path) -> Iterator[IO[bytes]]:
-    """A file that gets its name only when it is complete."""
-    partial = path.with_name(path.name + ".partial")
-    try:
-        with partial.open("wb") as file:
-            yield file
-        partial.replace(path)
-    finally:
-        partial.unlink(missing_ok=True)
 
 
 def bounds_of(client: MapClient) -> tuple[Float64, Float64]:

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from potclient.errors import BadReplyError, UsageError
+from potclient.files import save_npz
 from potclient.results import Bool, Float32, Float64, Occupancy, as_points
 from potschemas.messages import Array, DType, Kernels
 from potschemas.wire import WireError, decode_array, encode_array
@@ -141,21 +142,16 @@ class KernelSet:
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write an .npz (no pickle), whole or not at all; the name is taken as given."""
-        target = Path(path)
-        partial = target.with_name(target.name + ".partial")
-        with partial.open("wb") as file:
-            np.savez_compressed(
-                file,
-                allow_pickle=False,
-                potclient_kernels=np.int64(_FILE_VERSION),
-                observed_activation=np.float64(self.observed_activation),
-                prior_var=np.float64(self.prior_var),
-                residual_var=np.float64(self.residual_var),
-                mean_moderation=np.float64(self.mean_moderation),
-                map_revision=np.int64(self.map_revision),
-                **{name: getattr(self, name) for name in _SHAPES},
-            )
-        partial.replace(target)
+        save_npz(
+            path,
+            potclient_kernels=np.int64(_FILE_VERSION),
+            observed_activation=np.float64(self.observed_activation),
+            prior_var=np.float64(self.prior_var),
+            residual_var=np.float64(self.residual_var),
+            mean_moderation=np.float64(self.mean_moderation),
+            map_revision=np.int64(self.map_revision),
+            **{name: getattr(self, name) for name in _SHAPES},
+        )
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> KernelSet:

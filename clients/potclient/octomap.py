@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from potclient.errors import UsageError
+from potclient.files import whole
 from potclient.results import Bool
 
 Int64 = NDArray[np.int64]
@@ -95,10 +96,8 @@ def write_bt(path: str | os.PathLike[str], leaves: Leaves, resolution: float) ->
         f"{_MAGIC.decode()}\n# (feel free to add / change comments, but leave the first line as it is!)\n#\n"
         f"id OcTree\nsize {n_nodes}\nres {resolution:.12g}\ndata\n"
     )
-    target = Path(path)
-    partial = target.with_name(target.name + ".partial")
-    partial.write_bytes(header.encode() + bits[np.argsort(place)].astype("<u2").tobytes())
-    partial.replace(target)
+    with whole(path) as file:
+        file.write(header.encode() + bits[np.argsort(place)].astype("<u2").tobytes())
     return n_nodes
 
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 import dataclasses
 import os
 from functools import cached_property
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from potclient.errors import BadReplyError, MapServerError, UsageError, error_from_code
+from potclient.files import save_npz
 from potschemas import messages
 from potschemas.messages import DType, ReceiptStatus, SectorReport
 from potschemas.wire import WireError, decode_array
@@ -114,18 +114,13 @@ class Grid:
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write an .npz (no pickle), whole or not at all; `numpy.load` reads it."""
-        target = Path(path)
-        partial = target.with_name(target.name + ".partial")
-        with partial.open("wb") as file:
-            np.savez_compressed(
-                file,
-                allow_pickle=False,
-                lower=self.lower,
-                resolution=np.float64(self.resolution),
-                revision=np.int64(self.revision),
-                **{name: getattr(self, name) for name in _FIELDS},
-            )
-        partial.replace(target)
+        save_npz(
+            path,
+            lower=self.lower,
+            resolution=np.float64(self.resolution),
+            revision=np.int64(self.revision),
+            **{name: getattr(self, name) for name in _FIELDS},
+        )
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False, kw_only=True)

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from potschemas import keys, messages, wire
 from potschemas.messages import DType, ErrorCode
+from potserver.adapters.kernel_coding import code_kernels
 from potserver.adapters.limits import Limits
 from potserver.adapters.ports import Snapshot
 from potserver.domain.running_scores import RunningScores
@@ -47,6 +48,7 @@ from potserver.errors import (
 )
 from potserver.services.atom_store import AtomChange
 from potserver.services.health import Latency
+from potserver.services.tile_query import MANTISSA_BITS, KnownTiles, TilesPlan
 
 MessageT = TypeVar("MessageT", bound=messages.Message)
 UNKNOWN_SEQ = -1  # in the receipt of a cloud whose number could not be read
@@ -112,6 +114,16 @@ class RiskRequest(NamedTuple):
     resolution_m: float | None
     correlation_m: float | None
     dims: int
+    deadline_ms: float | None
+
+
+class TilesRequest(NamedTuple):
+    """A decoded `q/tiles`."""
+
+    known: KnownTiles | None
+    lower: list[float] | None
+    upper: list[float] | None
+    mantissa_bits: int
     deadline_ms: float | None
 
 
@@ -381,6 +393,36 @@ def decode_params_query(payload: bytes) -> ParamsRequest:
     """
     query = _decode(payload, messages.ParamsQuery)
     return ParamsRequest(query.lower, query.upper, query.deadline_ms)
+
+
+def decode_tiles_query(payload: bytes, limits: Limits) -> TilesRequest:
+    """What the asker has, and the box that it asks about; the query service judges the values.
+
+    Raises:
+        BadMessageError, ShapeError: see `decode_cloud`.
+        TooLargeError: too many bytes or known tiles.
+    """
+    query = _decode(payload, messages.TilesQuery, limits.max_query_bytes)
+    known = None
+    if query.known is not None:
+        if query.epoch is None:
+            raise BadMessageError("pot.tiles_query.v1: `known` needs the `epoch` that its revisions are of")
+        with _typed_errors():
+            columns = wire.unpack_array(
+                query.known,
+                "known",
+                dtypes=(DType.INT64,),
+                shape=(4, None),
+                max_elements=4 * limits.max_query_tiles,
+            )
+        known = KnownTiles(query.epoch, columns[:3].T, columns[3])
+    return TilesRequest(
+        known=known,
+        lower=query.lower,
+        upper=query.upper,
+        mantissa_bits=MANTISSA_BITS if query.mantissa_bits is None else query.mantissa_bits,
+        deadline_ms=query.deadline_ms,
+    )
 
 
 def decode_atoms_query(payload: bytes, limits: Limits) -> AtomsRequest:
@@ -724,6 +766,29 @@ def encode_params_part(
     )
 
 
+def encode_tiles_part(plan: TilesPlan, part: int) -> Wire:
+    """One part of the reply to `q/tiles`; the tiles that are gone travel in part 0."""
+    run, rule = plan.part(part), plan.rule
+    return _wire(
+        messages.TilesPart(
+            part=part,
+            n_parts=plan.n_parts,
+            epoch=plan.epoch,
+            map_revision=plan.map_revision,
+            whole=plan.is_whole,
+            tile_size_m=float(plan.tile_size_m),
+            tiles=wire.pack_array(np.vstack([run.indices.T, run.revisions])),
+            counts=wire.pack_array(run.counts),
+            gone=wire.pack_array(plan.gone.T) if part == 0 and len(plan.gone) else None,
+            kernels=code_kernels(run.kernels, plan.spacings_m),
+            observed_activation=float(rule.observed_activation),
+            prior_var=float(rule.prior_var),
+            residual_var=float(rule.residual_var),
+            mean_moderation=float(rule.mean_moderation),
+        )
+    )
+
+
 def encode_atom_list(atoms: Iterable[Atom], usage: Mapping[str, int]) -> Wire:
     """The dictionary's table."""
     return _wire(messages.AtomList(atoms=[_atom_info(atom, usage) for atom in atoms]))
@@ -795,6 +860,7 @@ def encode_info(
                 max_query_poses=limits.max_query_poses,
                 max_query_spheres=limits.max_query_spheres,
                 max_query_samples=limits.max_query_samples,
+                max_query_tiles=limits.max_query_tiles,
             ),
             started_ns=started_ns,
         )

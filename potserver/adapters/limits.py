@@ -18,6 +18,7 @@ class Limits:
     max_query_poses: int = 5_000
     max_query_spheres: int = 256
     max_query_samples: int = 4_000_000  # steps of all rays of a query; cells at all poses of one
+    max_query_tiles: int = 100_000  # that the asker of one `q/tiles` has
     max_coordinate_m: float = 2.0e7  # each coordinate in the map frame; UTM northings end at 1e7
     max_robots: int = 1024  # robots remembered at once: stamps, poses, presence
 

@@ -22,6 +22,7 @@ from potserver.domain.types import (
     Unknown,
 )
 from potserver.services.settings import MappingSettings
+from potserver.services.tile_query import KnownTiles, TilesPlan
 
 
 class Payload(Protocol):
@@ -124,3 +125,12 @@ class Asker(Protocol):
     def params(
         self, lower: Sequence[float] | None, upper: Sequence[float] | None, *, part_kernels: int
     ) -> tuple[list[KernelSet], int]: ...
+    def tiles(
+        self,
+        known: KnownTiles | None,
+        *,
+        lower: Sequence[float] | None,
+        upper: Sequence[float] | None,
+        mantissa_bits: int,
+        part_kernels: int,
+    ) -> TilesPlan: ...

@@ -58,6 +58,7 @@ class MapQueryable:
         limits: Limits,
         grid_part_cells: int,
         params_part_kernels: int,
+        tiles_part_kernels: int,
         encode_info: Callable[[], codec.Wire],
     ) -> None:
         self._keys = map_keys
@@ -65,6 +66,7 @@ class MapQueryable:
         self._intake, self._receipts, self._pool = intake, receipts, pool
         self._health, self._limits = health, limits
         self._grid_part_cells, self._params_part_kernels = grid_part_cells, params_part_kernels
+        self._tiles_part_kernels = tiles_part_kernels
         self._encode_info = encode_info
         self._ops: dict[
             str, tuple[type[messages.Message], Callable[[bytes, float], Iterator[codec.Wire]]]
@@ -74,6 +76,7 @@ class MapQueryable:
             "rays": (messages.RaysQuery, self._rays),
             "risk": (messages.RiskQuery, self._risk),
             "params": (messages.ParamsQuery, self._params),
+            "tiles": (messages.TilesQuery, self._tiles),
             "atoms": (messages.AtomsQuery, self._atoms),
             "info": (messages.InfoQuery, self._info),
         }
@@ -240,6 +243,20 @@ class MapQueryable:
                 kernels=kernels,
                 rule=snapshot.rule,
             )
+
+    def _tiles(self, payload: bytes, arrived_s: float) -> Iterator[codec.Wire]:
+        request = codec.decode_tiles_query(payload, self._limits)
+        _check_deadline(arrived_s, request.deadline_ms)
+        plan = self._asker.tiles(
+            request.known,
+            lower=request.lower,
+            upper=request.upper,
+            mantissa_bits=request.mantissa_bits,
+            part_kernels=self._tiles_part_kernels,
+        )
+        for part in range(plan.n_parts):
+            self._check_may_go_on(arrived_s, request.deadline_ms)
+            yield codec.encode_tiles_part(plan, part)
 
     def _check_may_go_on(self, arrived_s: float, deadline_ms: float | None) -> None:
         """Between the parts of an answer.

@@ -10,7 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potserver.numerics.fastexp import FAST, exp32
-from potserver.numerics.kernel_index import Float32, Float64, KernelIndex, _box, _gather, group_points
+from potserver.numerics.kernel_index import (
+    Float32,
+    Float64,
+    KernelIndex,
+    _about_middle,
+    _box,
+    _gather,
+    group_points,
+)
 from potserver.numerics.occupancy import Float, predict_occupancy
 from potserver.numerics.threads import parallel_map, spans
 
@@ -112,19 +120,7 @@ def _gradient_cubes(
         n, found = _gather(
             lower, upper, hinge, columns, level_start, level_edge, level_cell, level_size, keys, found
         )
-        if n > local.shape[1]:
-            local = np.empty((6, 2 * n), np.float32)
-        cx = 0.5 * (lower[0] + upper[0])
-        cy = 0.5 * (lower[1] + upper[1])
-        cz = 0.5 * (lower[2] + upper[2])
-        for i in range(n):
-            m = found[i]
-            local[0, i] = hinge[m, 0] - cx
-            local[1, i] = hinge[m, 1] - cy
-            local[2, i] = hinge[m, 2] - cz
-            local[3, i] = columns[0, m]
-            local[4, i] = columns[1, m]
-            local[5, i] = columns[2, m]
+        local, cx, cy, cz = _about_middle(lower, upper, hinge, columns, found, n, local)
         for q in range(a, b):
             sums[0, q], sums[1, q], sums[2, q], sums[3, q], sums[4, q], sums[5, q], sums[6, q], sums[7, q], sums[
                 8, q

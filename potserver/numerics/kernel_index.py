@@ -426,6 +426,25 @@ def _box(points, a, b, lower, upper):
 
 
 @nb.njit(nogil=True, error_model="numpy", cache=True)
+def _about_middle(lower, upper, hinge, columns, found, n, local):
+    """The n found kernels in `local`, made longer if need be, with hinges relative to the middle of a box; and that middle."""
+    if n > local.shape[1]:
+        local = np.empty((6, 2 * n), np.float32)
+    cx = 0.5 * (lower[0] + upper[0])
+    cy = 0.5 * (lower[1] + upper[1])
+    cz = 0.5 * (lower[2] + upper[2])
+    for i in range(n):
+        m = found[i]
+        local[0, i] = hinge[m, 0] - cx
+        local[1, i] = hinge[m, 1] - cy
+        local[2, i] = hinge[m, 2] - cz
+        local[3, i] = columns[0, m]
+        local[4, i] = columns[1, m]
+        local[5, i] = columns[2, m]
+    return local, cx, cy, cz
+
+
+@nb.njit(nogil=True, error_model="numpy", cache=True)
 def _sum_cubes(points, cuts, hinge, columns, level_start, level_edge, level_cell, level_size, keys, sums):
     found = np.empty(4096, np.int64)
     local = np.empty((6, 4096), np.float32)
@@ -437,19 +456,7 @@ def _sum_cubes(points, cuts, hinge, columns, level_start, level_edge, level_cell
         n, found = _gather(
             lower, upper, hinge, columns, level_start, level_edge, level_cell, level_size, keys, found
         )
-        if n > local.shape[1]:
-            local = np.empty((6, 2 * n), np.float32)
-        cx = 0.5 * (lower[0] + upper[0])
-        cy = 0.5 * (lower[1] + upper[1])
-        cz = 0.5 * (lower[2] + upper[2])
-        for i in range(n):
-            m = found[i]
-            local[0, i] = hinge[m, 0] - cx
-            local[1, i] = hinge[m, 1] - cy
-            local[2, i] = hinge[m, 2] - cz
-            local[3, i] = columns[0, m]
-            local[4, i] = columns[1, m]
-            local[5, i] = columns[2, m]
+        local, cx, cy, cz = _about_middle(lower, upper, hinge, columns, found, n, local)
         for q in range(a, b):
             sums[0, q], sums[1, q], sums[2, q] = _sum_point(
                 np.float32(points[q, 0] - cx), np.float32(points[q, 1] - cy), np.float32(points[q, 2] - cz),

@@ -26,6 +26,7 @@ from potserver.numerics.kernel_index import Int64
 from potserver.numerics.lattice import covered_cells, most_cells
 from potserver.numerics.rays import FirstReturns
 from potserver.services.mapping import MappingService
+from potserver.services.tile_query import MANTISSA_BITS, KnownTiles, TilesPlan, plan_tiles
 
 _MAX_QUANTILES = 16
 _MAX_LATTICE = 2**21 - 1  # cells along an axis: three of them make one integer
@@ -190,6 +191,7 @@ class QueryService:
         max_rays: int = 50_000,
         max_poses: int = 5_000,
         max_spheres: int = 256,
+        max_known_tiles: int = 100_000,
         max_coordinate_m: float = 1e7,
     ) -> None:
         """Bound what may be asked.
@@ -200,6 +202,7 @@ class QueryService:
             max_samples: Places that one query of rays (steps of all rays) or of risk (cells at all poses) may look at.
             max_rays: Of one query.
             max_poses, max_spheres: Of one query of risk.
+            max_known_tiles: That the asker of one query of tiles has.
             max_coordinate_m: Of everything, absolute.
         """
         self._mapping = mapping
@@ -209,6 +212,7 @@ class QueryService:
         self.max_rays = max_rays
         self.max_poses = max_poses
         self.max_spheres = max_spheres
+        self.max_known_tiles = max_known_tiles
         self.max_coordinate_m = max_coordinate_m
 
     def occupancy(self, points: ArrayLike, *, with_gradient: bool = False) -> Occupancy:
@@ -419,6 +423,48 @@ class QueryService:
         chosen = kernels.take(inside)
         starts = range(0, max(len(chosen), 1), part_kernels)
         return [chosen.take(slice(i, i + part_kernels)) for i in starts], snapshot.map_revision
+
+    def tiles(
+        self,
+        known: KnownTiles | None = None,
+        *,
+        lower: ArrayLike | None = None,
+        upper: ArrayLike | None = None,
+        mantissa_bits: int = MANTISSA_BITS,
+        part_kernels: int = 20_000,
+    ) -> TilesPlan:
+        """Plan what brings an asker from the tiles that it has to those of the newest state of the map.
+
+        Args:
+            known: What the asker has; None = nothing.
+            lower, upper: (3,) m, map frame: only tiles that this box touches are compared; None = no bound on that side.
+            mantissa_bits: Of each weight's mean and variance, 2 to 23. With b of them the latent mean changes by at most
+                2^-(b + 1) sum_m |weight_mean_m| phi_m, and the probability by at most a quarter of that, beside a relative
+                2^-(b + 1) of the latent variance.
+            part_kernels: Kernels of a part, at most.
+        Raises:
+            ShapeError, BadPointsError, OutOfRangeError: an illegal corner, or known tiles of unequal number.
+            TooLargeError: too many known tiles.
+        """
+        if known is not None:
+            n = len(known.indices)
+            if known.indices.shape != (n, 3) or known.revisions.shape != (n,):
+                raise ShapeError(
+                    f"known tiles: {known.indices.shape} and {known.revisions.shape}, need (N, 3) and (N,)"
+                )
+            if n > self.max_known_tiles:
+                raise TooLargeError(f"{n} known tiles, the limit is {self.max_known_tiles}; ask about a box")
+        if not 2 <= mantissa_bits <= MANTISSA_BITS:
+            raise BadPointsError(f"mantissa_bits is {mantissa_bits}, need 2 to {MANTISSA_BITS}")
+        return plan_tiles(
+            self._mapping.state,
+            known,
+            None if lower is None else self._corner(lower),
+            None if upper is None else self._corner(upper),
+            tile_size_m=self._mapping.settings.tile_size_m,
+            mantissa_bits=mantissa_bits,
+            part_kernels=part_kernels,
+        )
 
     def warm_up(self) -> None:
         """Compile what questions of every kind use, so that the first one does not wait for that."""

@@ -6,6 +6,7 @@ The numbers are exact in binary, so that the readable form shows what the bytes 
 from __future__ import annotations
 
 import math
+import zlib
 
 import msgspec
 import numpy as np
@@ -257,6 +258,55 @@ def examples() -> dict[str, m.Message]:
     add(m.ParamsPart(part=0, n_parts=2, map_revision=31, kernels=kernels))
     add(m.ParamsPart(part=0, n_parts=1, map_revision=0, kernels=no_kernels), "empty")
 
+    add(
+        m.TilesQuery(
+            lower=[-8.0, -8.0, -2.0],
+            upper=[8.0, 8.0, 4.0],
+            epoch=2**62 + 1,
+            known=_packed(np.array([[0, -1], [-1, -1], [0, 0], [30, 7]], np.int64)),
+            mantissa_bits=10,
+            deadline_ms=1000.0,
+        )
+    )
+    add(m.TilesQuery(), "whole_map")
+    add(_tiles_part())
+    add(_tiles_part(deflated=True), "deflated")
+    add(
+        msgspec.structs.replace(
+            _tiles_part(),
+            n_parts=1,
+            whole=True,
+            gone=None,
+            kernels=m.CodedKernels(
+                kinds=_packed(np.array([[0.0625, 0.5]] * 3 + [[8.0, 9.0], [4.0, 4.0]], np.float32)),
+                lattices=_packed(np.zeros((4, 2))),
+                cells=_packed(np.zeros((3, 0), np.uint8)),
+                hinge_mean=_packed(np.array([[0.5, 7.0], [1.5, 7.25], [2.0, 7.5]], np.float32)),
+                weight_mean=_packed(np.array([3.0, -2.0], np.float32)),
+                weight_var=_packed(np.array([0.5, 0.25], np.float32)),
+            ),
+        ),
+        "plain",
+    )
+    add(
+        msgspec.structs.replace(
+            _tiles_part(),
+            n_parts=1,
+            tiles=_packed(np.zeros((4, 0), np.int64)),
+            counts=_packed(np.zeros(0, np.int64)),
+            gone=None,
+            kernels=m.CodedKernels(
+                kinds=_packed(np.zeros((5, 0), np.float32)),
+                lattices=_packed(np.zeros((4, 0))),
+                cells=_packed(np.zeros((3, 0), np.uint8)),
+                hinge_mean=_packed(np.zeros((3, 0), np.float32)),
+                weight_mean=_packed(np.zeros(0, np.float32)),
+                weight_var=_packed(np.zeros(0, np.float32)),
+            ),
+        ),
+        "nothing_changed",
+    )
+
     info = m.AtomInfo(
         atom_id="street-corner-03",
         dims=3,
@@ -304,6 +354,8 @@ def examples() -> dict[str, m.Message]:
         max_query_samples=4_000_000,
     )
     add(_info(ray_limits, lower=[-40.0, -32.5, -2.0], upper=[88.0, 64.0, 6.5], n_scans=31), "ray_limits")
+    tile_limits = msgspec.structs.replace(ray_limits, max_query_tiles=100_000)
+    add(_info(tile_limits, lower=[-40.0, -32.5, -2.0], upper=[88.0, 64.0, 6.5], n_scans=31), "tile_limits")
     add(m.StatsQuery())
     add(
         m.Stats(
@@ -366,6 +418,47 @@ def _f4(values: ArrayLike) -> m.Array:
 
 def _f8(values: ArrayLike) -> m.Array:
     return encode_array(np.asarray(values, np.float64))
+
+
+def _packed(array: np.ndarray[tuple[int, ...], np.dtype[np.generic]]) -> m.Packed:
+    """As `wire.pack_array`, but stored and not deflated: compressors may differ, the examples may not."""
+    wire = encode_array(array)
+    planes = np.frombuffer(wire.data, np.uint8).reshape(-1, array.itemsize).T.tobytes()
+    n = len(planes)
+    stored = b"\x01" + n.to_bytes(2, "little") + (n ^ 0xFFFF).to_bytes(2, "little") + planes
+    stream = b"\x78\x01" + stored + zlib.adler32(planes).to_bytes(4, "big")
+    return m.Packed(dtype=wire.dtype, shape=wire.shape, deflated=stream)
+
+
+def _tiles_part(*, deflated: bool = False) -> m.TilesPart:
+    """Two tiles of a map with kernels of 0.5 m on a lattice, and one kernel that is on none."""
+    counts = _packed(np.array([2, 1], np.int64))
+    if deflated:  # the same, as a compressor gave it
+        counts = m.Packed(dtype=m.DType.INT64, shape=[2], deflated=bytes.fromhex("78da636264400100003f0004"))
+    return m.TilesPart(
+        part=0,
+        n_parts=2,
+        epoch=2**62 + 1,
+        map_revision=31,
+        whole=False,
+        tile_size_m=8.0,
+        tiles=_packed(np.array([[0, 1], [-1, -1], [0, 0], [31, 31]], np.int64)),
+        counts=counts,
+        gone=_packed(np.array([[-1], [-1], [0]], np.int64)),
+        kernels=m.CodedKernels(
+            kinds=_packed(np.array([[0.0625, 0.5]] * 3 + [[8.0, 9.0], [4.0, 4.0]], np.float32)),
+            lattices=_packed(np.array([[0.5, 0.0], [0.25, 0.0], [0.25, 0.0], [0.25, 0.0]])),
+            kind=_packed(np.array([0, 1, 0], np.uint8)),
+            cells=_packed(np.array([[0, 15], [1, 2], [4, 4]], np.uint8)),
+            hinge_mean=_packed(np.array([[7.125], [0.75], [2.5]], np.float32)),
+            weight_mean=_packed(np.array([3.0, -2.0, 1.5], np.float32)),
+            weight_var=_packed(np.array([0.5, 0.25, 0.125], np.float32)),
+        ),
+        observed_activation=0.125,
+        prior_var=64.0,
+        residual_var=32.0,
+        mean_moderation=0.0625,
+    )
 
 
 def _bool(values: list[bool]) -> m.Array:

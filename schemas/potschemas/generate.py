@@ -27,8 +27,8 @@ import numpy as np
 
 from potschemas import messages
 from potschemas.examples import examples
-from potschemas.messages import ALL_MESSAGES, Array, ErrorCode, Message
-from potschemas.wire import encode
+from potschemas.messages import ALL_MESSAGES, Array, ErrorCode, Message, Packed
+from potschemas.wire import decode_array, encode, unpack_array
 
 PACKAGE = Path(__file__).resolve().parent
 README = PACKAGE.parent / "README.md"
@@ -61,13 +61,13 @@ def json_schema(kind: type[Message]) -> dict[str, Any]:
 
 def readable(value: Any) -> Any:
     """The JSON form of a message, or of a part of one: arrays get their `values`, NaN and infinity become null."""
-    if isinstance(value, Array):
-        array = np.frombuffer(value.data, value.dtype.value).reshape(value.shape)
+    if isinstance(value, Array | Packed):
+        name, payload = ("data", value.data) if isinstance(value, Array) else ("deflated", value.deflated)
         return {
             "dtype": value.dtype.value,
             "shape": value.shape,
-            "data": base64.b64encode(value.data).decode("ascii"),
-            "values": readable(array.tolist()),
+            name: base64.b64encode(payload).decode("ascii"),
+            "values": readable(_elements(value).tolist()),
         }
     if isinstance(value, msgspec.Struct):
         present = {name: getattr(value, name) for name in value.__struct_fields__}
@@ -79,6 +79,14 @@ def readable(value: Any) -> Any:
     if isinstance(value, Enum):
         return value.value
     return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _elements(value: Array | Packed) -> np.ndarray[Any, Any]:
+    if isinstance(value, Array):
+        return decode_array(value, "", dtypes=(value.dtype,), shape=tuple(value.shape))
+    return unpack_array(
+        value, "", dtypes=(value.dtype,), shape=tuple(value.shape), max_elements=math.prod(value.shape)
+    )
 
 
 def field_notes(struct: type) -> dict[str, str]:

@@ -41,6 +41,7 @@ Probability = Annotated[float, msgspec.Meta(ge=0, le=1)]
 _Quantile = Annotated[float, msgspec.Meta(gt=0, lt=1)]
 Quantiles = Annotated[list[_Quantile], msgspec.Meta(max_length=16)]
 TileIndex = Annotated[list[_Int64], msgspec.Meta(min_length=3, max_length=3)]
+MantissaBits = Annotated[int, msgspec.Meta(ge=2, le=23)]
 
 # The type and the default of a field that a released schema got later: it is left out of the bytes, so that messages without
 # it stay as they were.
@@ -49,6 +50,7 @@ ABSENT = msgspec.UNSET
 
 MAX_AXES = 4
 MAX_AXIS_LENGTH = 2**31 - 1
+MAX_PART_KERNELS = 100_000  # in one part of a `q/tiles` reply: what a receiver has to be ready to unpack
 _AxisLength = Annotated[int, msgspec.Meta(ge=0, le=MAX_AXIS_LENGTH)]
 ArrayShape = Annotated[list[_AxisLength], msgspec.Meta(max_length=MAX_AXES)]
 
@@ -69,6 +71,17 @@ class Array(msgspec.Struct, frozen=True, kw_only=True):
     dtype: DType  # element type
     shape: ArrayShape  # at most 4 axes; the empty list is one single number
     data: bytes  # a MessagePack bin object of product(shape) elements; never a string
+
+
+class Packed(msgspec.Struct, frozen=True, kw_only=True):
+    """A dense array, little-endian and deflated byte by byte: the first byte of every element, then the second, and so on.
+
+    Bytes of equal weight are alike, so they deflate better together than element by element.
+    """
+
+    dtype: DType  # element type
+    shape: ArrayShape  # as in `Array`
+    deflated: bytes  # a zlib stream (RFC 1950) that inflates to exactly product(shape) elements, in C order
 
 
 class Message(msgspec.Struct, frozen=True, kw_only=True):
@@ -351,6 +364,55 @@ class ParamsPart(Message, frozen=True, kw_only=True):
     kernels: Kernels  # this part's kernels; the origin may differ from part to part
 
 
+class TilesQuery(Message, frozen=True, kw_only=True):
+    """`q/tiles`: what of the map's tiles differs from what the asker has; the reply comes in parts."""
+
+    schema: ClassVar[str] = "pot.tiles_query.v1"
+
+    lower: Vector3 | None = None  # m, map frame; of a box: the tiles that it touches are meant
+    upper: Vector3 | None = None  # m, map frame; an absent corner is no bound on its side
+    epoch: Count | None = None  # that `known` is of, from an earlier reply; absent = nothing is known
+    known: Packed | None = None  # (4, N) int64: index x, y, z and revision of each tile that the asker has
+    mantissa_bits: MantissaBits | None = None  # of each weight to send, rounded; absent = 23, which is all
+    deadline_ms: Positive | None = None  # ms from arrival; past it no work and no part begins
+
+
+class CodedKernels(msgspec.Struct, frozen=True, kw_only=True):
+    """K kernels of some tiles, hinges relative to the lower corners of their tiles. A kind is a shape and a lattice.
+
+    The hinge of a kernel whose kind has a spacing is offset + cell * spacing, computed in float64 and rounded to float32.
+    """
+
+    kinds: Packed  # (5, U) float32: hinge_var along x, y, z, m^2; gamma_shape; gamma_rate, m^2
+    lattices: Packed  # (4, U) float64, m: spacing of each kind, 0 = none; offset along x, y, z
+    kind: Packed | None = None  # (K,) uint8 or int64, which kind each is of; absent = each its own, U is K
+    cells: Packed  # (3, L) uint8 or int64: of the L kernels whose kinds have a spacing, in order
+    hinge_mean: Packed  # (3, K - L) float32, m: of the others, in order
+    weight_mean: Packed  # (K,) float32, log-odds
+    weight_var: Packed  # (K,) float32, log-odds^2
+
+
+class TilesPart(Message, frozen=True, kw_only=True):
+    """One part of a `q/tiles` reply: a run of kernels, tile after tile. A tile may go on in the next part."""
+
+    schema: ClassVar[str] = "pot.tiles_part.v1"
+
+    part: Count  # 0 .. n_parts - 1; parts may arrive in any order
+    n_parts: PositiveCount  # how many parts the whole reply has
+    epoch: Count  # drawn anew when a map is created, cleared or loaded; only revisions of one can be compared
+    map_revision: Count  # the same in all parts
+    whole: bool  # the epoch is not the asker's: these are all tiles of the box, what it had is void
+    tile_size_m: Positive  # m, edge of a tile; its lower corner is index * tile_size_m
+    tiles: Packed  # (4, T) int64: index x, y, z and revision of each tile that differs
+    counts: Packed  # (T,) int64, kernels of each tile in this part, at least 1
+    gone: Packed | None = None  # (3, G) int64, indices of tiles known to the asker and not there; in part 0
+    kernels: CodedKernels  # of the tiles one after the other
+    observed_activation: Finite  # summed activation below which a point is unobserved
+    prior_var: Finite  # log-odds^2, of the latent where nothing was observed
+    residual_var: Finite  # log-odds^2, added in the measure that the summed activation falls short of 1
+    mean_moderation: Finite  # share of the latent variance that pulls the mean towards 0.5
+
+
 class AtomInfo(msgspec.Struct, frozen=True, kw_only=True):
     """One line of the dictionary's table."""
 
@@ -432,6 +494,7 @@ class Limits(msgspec.Struct, frozen=True, kw_only=True):
     max_query_poses: Count | Absent = ABSENT  # in one `q/risk`
     max_query_spheres: Count | Absent = ABSENT  # in one `q/risk`
     max_query_samples: Count | Absent = ABSENT  # steps of all rays of a `q/rays`, cells of a `q/risk`
+    max_query_tiles: Count | Absent = ABSENT  # known to the asker of one `q/tiles`
 
 
 class Info(Message, frozen=True, kw_only=True):
@@ -577,6 +640,8 @@ ALL_MESSAGES: tuple[type[Message], ...] = (
     Risk,
     ParamsQuery,
     ParamsPart,
+    TilesQuery,
+    TilesPart,
     AtomList,
     Atom,
     AtomsQuery,

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import math
 import re
+import zlib
 from collections.abc import Iterable
 from typing import Any, NamedTuple, TypeVar, cast
 
@@ -22,7 +23,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from potschemas.messages import MAX_AXES, MAX_AXIS_LENGTH, Array, DType, ErrorCode, Message
+from potschemas.messages import MAX_AXES, MAX_AXIS_LENGTH, Array, DType, ErrorCode, Message, Packed
 
 MessageT = TypeVar("MessageT", bound=Message)
 
@@ -33,6 +34,7 @@ MAX_DEPTH = (
 MAX_ITEMS = 100_000  # entries of one map or list; arrays are bytes, so real messages stay far below
 MAX_VALUES = 100_000  # values and keys in all; a revision tick of 24,000 tiles fits
 MAX_STRING_BYTES = 65_536
+_DEFLATE_LEVEL = 1  # measured on maps: 6 gives 3 % fewer bytes and takes twice the time
 _MAX_ERROR_CHARS = 300  # a hostile sender must not fill our log through an error text
 _UNSAID = ("", "zenoh/bytes", MIME)  # Zenoh's default, and ours without a schema
 
@@ -133,15 +135,7 @@ def encode_array(array: NDArray[Any]) -> Array:
     Raises:
         WireError: code `bad_array`: the dtype is not one that the wire carries, or there are too many axes.
     """
-    try:
-        dtype = DType(array.dtype.newbyteorder("<").str)
-    except ValueError as error:
-        raise WireError(
-            ErrorCode.BAD_ARRAY, f"dtype {array.dtype} does not travel; use one of {[d.value for d in DType]}"
-        ) from error
-    if array.ndim > MAX_AXES or max(array.shape, default=0) > MAX_AXIS_LENGTH:
-        raise WireError(ErrorCode.BAD_ARRAY, f"shape {array.shape} does not travel: at most {MAX_AXES} axes")
-    little = np.ascontiguousarray(array, dtype=dtype.value)
+    dtype, little = _little_endian(array)
     return Array(dtype=dtype, shape=list(array.shape), data=little.tobytes())
 
 
@@ -162,6 +156,79 @@ def decode_array(
     Raises:
         WireError: code `bad_array`: dtype, number of axes, an axis length, or the byte count is wrong.
     """
+    n_bytes = _check_form(array, name, dtypes, shape)
+    if n_bytes != len(array.data):
+        raise WireError(
+            ErrorCode.BAD_ARRAY,
+            f"{name}: {len(array.data)} bytes for shape {tuple(array.shape)} of {array.dtype.value}",
+        )
+    return _view(array.data, array, name)
+
+
+def pack_array(array: NDArray[Any]) -> Packed:
+    """An array for the wire, deflated by planes of bytes.
+
+    Raises:
+        WireError: see `encode_array`.
+    """
+    dtype, little = _little_endian(array)
+    planes = little.reshape(-1).view(np.uint8).reshape(-1, little.itemsize).T
+    return Packed(
+        dtype=dtype, shape=list(array.shape), deflated=zlib.compress(planes.tobytes(), _DEFLATE_LEVEL)
+    )
+
+
+def unpack_array(
+    packed: Packed,
+    name: str,
+    *,
+    dtypes: tuple[DType, ...],
+    shape: tuple[int | tuple[int, ...] | None, ...],
+    max_elements: int,
+) -> NDArray[Any]:
+    """The read-only array of a packed one, checked as `decode_array` does; nothing longer than `max_elements` is inflated.
+
+    Raises:
+        WireError: code `too_large`: more elements; code `bad_array`: see `decode_array`, or not such a zlib stream.
+    """
+    n_bytes = _check_form(packed, name, dtypes, shape)
+    if math.prod(packed.shape) > max_elements:
+        raise WireError(
+            ErrorCode.TOO_LARGE, f"{name}: shape {tuple(packed.shape)}, the limit is {max_elements} elements"
+        )
+    inflater = zlib.decompressobj()
+    try:
+        planes = inflater.decompress(packed.deflated, n_bytes + 1)  # 0 would mean without a limit
+    except zlib.error as error:
+        raise WireError(ErrorCode.BAD_ARRAY, f"{name}: not a zlib stream ({error})") from error
+    if len(planes) != n_bytes or not inflater.eof or inflater.unused_data:
+        raise WireError(
+            ErrorCode.BAD_ARRAY,
+            f"{name}: the zlib stream does not end after the {n_bytes} bytes of shape {tuple(packed.shape)}",
+        )
+    itemsize = np.dtype(packed.dtype.value).itemsize
+    return _view(np.frombuffer(planes, np.uint8).reshape(itemsize, -1).T.tobytes(), packed, name)
+
+
+def _little_endian(array: NDArray[Any]) -> tuple[DType, NDArray[Any]]:
+    try:
+        dtype = DType(array.dtype.newbyteorder("<").str)
+    except ValueError as error:
+        raise WireError(
+            ErrorCode.BAD_ARRAY, f"dtype {array.dtype} does not travel; use one of {[d.value for d in DType]}"
+        ) from error
+    if array.ndim > MAX_AXES or max(array.shape, default=0) > MAX_AXIS_LENGTH:
+        raise WireError(ErrorCode.BAD_ARRAY, f"shape {array.shape} does not travel: at most {MAX_AXES} axes")
+    return dtype, np.ascontiguousarray(array, dtype=dtype.value)
+
+
+def _check_form(
+    array: Array | Packed,
+    name: str,
+    dtypes: tuple[DType, ...],
+    shape: tuple[int | tuple[int, ...] | None, ...],
+) -> int:
+    """How many bytes the elements take, if dtype and shape are accepted."""
     if array.dtype not in dtypes:
         need = " or ".join(d.value for d in dtypes)
         raise WireError(ErrorCode.BAD_ARRAY, f"{name}: dtype {array.dtype.value}, need {need}")
@@ -171,22 +238,20 @@ def decode_array(
     ):
         wanted = ", ".join("any" if axis is None else str(axis) for axis in shape)
         raise WireError(ErrorCode.BAD_ARRAY, f"{name}: shape {tuple(array.shape)}, need ({wanted})")
-    dtype = np.dtype(array.dtype.value)
-    n_bytes = math.prod(array.shape) * dtype.itemsize  # Python's integers do not overflow
-    if n_bytes != len(array.data):
-        raise WireError(
-            ErrorCode.BAD_ARRAY, f"{name}: {len(array.data)} bytes for shape {tuple(array.shape)} of {dtype}"
-        )
-    if array.dtype is DType.BOOL and np.any(np.frombuffer(array.data, np.uint8) > 1):
+    return math.prod(array.shape) * np.dtype(array.dtype.value).itemsize  # Python's integers do not overflow
+
+
+def _view(data: bytes, array: Array | Packed, name: str) -> NDArray[Any]:
+    if array.dtype is DType.BOOL and np.any(np.frombuffer(data, np.uint8) > 1):
         raise WireError(ErrorCode.BAD_ARRAY, f"{name}: a bool must be the byte 0 or 1")
     try:
-        return np.frombuffer(array.data, dtype).reshape(array.shape)
+        return np.frombuffer(data, array.dtype.value).reshape(array.shape)
     except ValueError as error:  # no elements, and axes whose product numpy cannot hold
         raise WireError(ErrorCode.BAD_ARRAY, f"{name}: shape {tuple(array.shape)}: {error}") from error
 
 
-# msgspec names the place at the end of its text; only Array has such fields below the top level
-_INSIDE_ARRAY = re.compile(r"`\$\.[^`]+\.(?:dtype|shape(?:\[\d+\])?|data)`\Z")
+# msgspec names the place at the end of its text; only Array and Packed have such fields below the top level
+_INSIDE_ARRAY = re.compile(r"`\$\.[^`]+\.(?:dtype|shape(?:\[\d+\])?|data|deflated)`\Z")
 
 
 def _plain_number(value: object) -> bool | int | float:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import copy
 import json
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -56,7 +57,11 @@ def test_the_readable_numbers_are_the_bytes(path: Path) -> None:
     def check(node: Any) -> None:
         if isinstance(node, dict) and "dtype" in node:
             array = np.array(node["values"], node["dtype"]).reshape(node["shape"])
-            assert array.tobytes() == base64.b64decode(node["data"])
+            if "data" in node:
+                assert array.tobytes() == base64.b64decode(node["data"])
+            else:
+                planes = np.frombuffer(array.tobytes(), np.uint8).reshape(-1, array.itemsize).T
+                assert planes.tobytes() == zlib.decompress(base64.b64decode(node["deflated"]))
         elif isinstance(node, dict | list):
             for item in node.values() if isinstance(node, dict) else node:
                 check(item)

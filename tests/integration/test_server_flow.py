@@ -441,7 +441,7 @@ def test_what_changes_a_map_must_name_it(make_rig: MakeRig) -> None:
 
 def test_unknown_operations_and_verbs_are_unsupported(make_rig: MakeRig) -> None:
     client = make_rig().client()
-    assert client.error("tiles").code is ErrorCode.UNSUPPORTED
+    assert client.error("fly").code is ErrorCode.UNSUPPORTED
     assert client.control("save").code is ErrorCode.UNSUPPORTED
     assert client.stats().counters["queries.unknown.unsupported"] == 1
 

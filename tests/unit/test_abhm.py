@@ -452,7 +452,9 @@ def test_without_evidence_the_bound_is_zero() -> None:
     settings = dataclasses.replace(QUICK, max_epochs=0, hinge_reach=0.5, gamma_shape=3.0)
     fit = data.fit(settings, sample_weight=np.zeros(400, np.float32))
     assert len(fit.elbos) == 2
-    np.testing.assert_allclose(fit.elbos, 0.0, atol=1e-4)  # Adam steps even where gradients are rounding errors
+    np.testing.assert_allclose(
+        fit.elbos, 0.0, atol=1e-4
+    )  # Adam steps even where gradients are rounding errors
     informed = data.fit(settings)
     assert max(informed.elbos) < -0.1
 

@@ -50,6 +50,15 @@ def _with(array: np.ndarray, row: Any, value: Any) -> np.ndarray:
     return changed
 
 
+def _first_kernel(**numbers: Any) -> Callable[[Atom], Atom]:
+    """Makes atoms whose first kernel has these numbers."""
+
+    def change(atom: Atom) -> Atom:
+        return _kernels(atom, **{n: _with(getattr(atom.kernels, n), 0, v) for n, v in numbers.items()})
+
+    return change
+
+
 # --- admission ----------------------------------------------------------------------------------------------
 
 
@@ -109,38 +118,14 @@ _BROKEN: dict[str, tuple[Refusal, Callable[[Atom], Atom]]] = {
         Refusal.POINTS_OUTSIDE,
         lambda a: dataclasses.replace(a, free_points=_with(a.free_points, 0, [3, 0, 50])),
     ),
-    "a kernel far away": (
-        Refusal.KERNELS_OUTSIDE,
-        lambda a: _kernels(a, hinge_mean=_with(a.kernels.hinge_mean, 0, [14, 0, 0])),
-    ),
-    "a kernel at no place": (
-        Refusal.KERNELS_OUTSIDE,
-        lambda a: _kernels(a, hinge_mean=_with(a.kernels.hinge_mean, 0, [1e308, 1e308, 0])),
-    ),
-    "a huge weight": (
-        Refusal.WILD_KERNELS,
-        lambda a: _kernels(a, weight_mean=_with(a.kernels.weight_mean, 0, 1e4)),
-    ),
-    "a weight without doubt": (
-        Refusal.WILD_KERNELS,
-        lambda a: _kernels(a, weight_var=_with(a.kernels.weight_var, 0, 0)),
-    ),
-    "a weight without knowledge": (
-        Refusal.WILD_KERNELS,
-        lambda a: _kernels(a, weight_var=_with(a.kernels.weight_var, 0, 1e6)),
-    ),
-    "a needle": (
-        Refusal.WILD_KERNELS,
-        lambda a: _kernels(a, gamma_rate=_with(a.kernels.gamma_rate, 0, 1e-30)),
-    ),
-    "a kernel as wide as the world": (
-        Refusal.WILD_KERNELS,
-        lambda a: _kernels(a, gamma_rate=_with(a.kernels.gamma_rate, 0, 1e30)),
-    ),
-    "a hinge that may be anywhere": (
-        Refusal.WILD_KERNELS,
-        lambda a: _kernels(a, hinge_var=_with(a.kernels.hinge_var, 0, 1e6)),
-    ),
+    "a kernel far away": (Refusal.KERNELS_OUTSIDE, _first_kernel(hinge_mean=[14, 0, 0])),
+    "a kernel at no place": (Refusal.KERNELS_OUTSIDE, _first_kernel(hinge_mean=[1e308, 1e308, 0])),
+    "a huge weight": (Refusal.WILD_KERNELS, _first_kernel(weight_mean=1e4)),
+    "a weight without doubt": (Refusal.WILD_KERNELS, _first_kernel(weight_var=0)),
+    "a weight without knowledge": (Refusal.WILD_KERNELS, _first_kernel(weight_var=1e6)),
+    "a needle": (Refusal.WILD_KERNELS, _first_kernel(gamma_rate=1e-30)),
+    "a kernel as wide as the world": (Refusal.WILD_KERNELS, _first_kernel(gamma_rate=1e30)),
+    "a hinge that may be anywhere": (Refusal.WILD_KERNELS, _first_kernel(hinge_var=1e6)),
     "weights of the wrong sign": (
         Refusal.UNEXPLAINED,
         lambda a: _kernels(a, weight_mean=-a.kernels.weight_mean),

@@ -28,7 +28,20 @@ from potclient.session import (
 from potschemas.messages import ErrorCode, ReceiptStatus
 from tests.integration.fake_server import FakeServer, free_port
 
-COMMANDS = ("publish", "query", "grid", "rays", "risk", "export", "watch", "load", "info", "atoms", "control")
+COMMANDS = (
+    "publish",
+    "query",
+    "grid",
+    "rays",
+    "risk",
+    "export",
+    "mirror",
+    "watch",
+    "load",
+    "info",
+    "atoms",
+    "control",
+)
 
 
 @pytest.fixture(scope="module")
@@ -122,6 +135,10 @@ def test_wrong_usage_ends_with_status_2(words: list[str], capsys: pytest.Capture
             ["grid", "--resolution", "1", "--lower", "1", "1", "1", "--upper", "0", "0", "0", "-o", "x"],
             "lower",
         ),
+        (["mirror", "--updates", "0"], "--updates"),
+        (["mirror", "--lower", "0", "0", "0"], "both corners"),
+        (["mirror", "--lower", "0", "0", "0", "--upper", "1", "-1", "1"], "above upper"),
+        (["mirror", "--mantissa-bits", "24"], "2 to 23"),
         (["atoms", "-o", "x.atom"], "-o saves the atom"),
         (["atoms", "list", "a"], "potclient atoms get a"),
         (["atoms", "get"], "one ID"),

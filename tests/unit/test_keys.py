@@ -33,7 +33,7 @@ def test_keys_are_the_contract() -> None:
 
 
 def test_operations_are_the_contract() -> None:
-    assert QUERY_OPS == ("integrate", "points", "grid", "rays", "risk", "params", "atoms", "info")
+    assert QUERY_OPS == ("integrate", "points", "grid", "rays", "risk", "params", "tiles", "atoms", "info")
     assert CONTROL_VERBS == ("clear", "drain")
 
 

@@ -186,6 +186,7 @@ def test_the_readme_has_the_limits_as_they_are(readme: str) -> None:
         wire.MAX_STRING_BYTES,
         messages.MAX_AXES,
         messages.MAX_AXIS_LENGTH,
+        messages.MAX_PART_KERNELS,
     ]
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import struct
 import tracemalloc
+import zlib
 from typing import Any
 
 import msgpack
@@ -26,7 +27,9 @@ from potschemas.wire import (
     encode,
     encode_array,
     encoding_of,
+    pack_array,
     schema_of,
+    unpack_array,
 )
 
 EXAMPLES = examples()
@@ -517,3 +520,80 @@ def test_an_encoding_that_says_something_else_is_refused(encoding: str) -> None:
     with pytest.raises(WireError, match=r"need 'application/msgpack;pot\.cloud\.v1'") as caught:
         check_encoding(encoding, m.Cloud)
     assert caught.value.code is ErrorCode.BAD_MESSAGE
+
+
+# --- packed arrays ----------------------------------------------------------------------------------
+
+
+def unpacked(deflated: bytes, shape: list[int], *, dtype: DType = DType.FLOAT32, limit: int = 1000) -> Any:
+    array = m.Packed(dtype=dtype, shape=shape, deflated=deflated)
+    return unpack_array(
+        array, "numbers", dtypes=(DType.FLOAT32, DType.BOOL), shape=(None,) * len(shape), max_elements=limit
+    )
+
+
+def test_a_packed_array_holds_its_bytes_by_planes() -> None:
+    numbers = np.array([[1.5, -2.0], [0.25, 3.0]], np.float32)
+    packed_array = pack_array(numbers)
+    planes = np.frombuffer(zlib.decompress(packed_array.deflated), np.uint8).reshape(4, 4)
+    assert [bytes(planes[:, i]) for i in range(4)] == [struct.pack("<f", v) for v in (1.5, -2.0, 0.25, 3.0)]
+    np.testing.assert_array_equal(unpacked(packed_array.deflated, [2, 2]), numbers)
+    assert pack_array(numbers.astype(">f4")) == packed_array
+
+
+STREAM = pack_array(np.arange(8, dtype=np.float32)).deflated
+
+
+@pytest.mark.parametrize(
+    ("deflated", "shape", "message"),
+    [
+        (STREAM[:-1], [8], "does not end"),
+        (STREAM[: len(STREAM) // 2], [8], "does not end"),
+        (STREAM + b"\x00", [8], "does not end"),
+        (STREAM + STREAM, [8], "does not end"),
+        (STREAM, [7], "does not end"),
+        (STREAM, [9], "does not end"),
+        (STREAM, [0], "does not end"),
+        (STREAM[:-1] + b"\x00", [8], "not a zlib stream"),  # its checksum
+        (zlib.compress(bytes(32))[2:-4], [8], "not a zlib stream"),  # deflated, without the frame
+        (b"", [8], "does not end"),
+        (b"", [0], "does not end"),
+        (bytes(32), [8], "not a zlib stream"),
+    ],
+)
+def test_a_stream_of_another_length_or_none_is_refused(
+    deflated: bytes, shape: list[int], message: str
+) -> None:
+    with pytest.raises(WireError, match=message) as caught:
+        unpacked(deflated, shape)
+    assert caught.value.code is ErrorCode.BAD_ARRAY
+
+
+def test_a_packed_array_of_another_form_is_refused() -> None:
+    with pytest.raises(WireError, match="dtype"):
+        unpacked(pack_array(np.arange(3)).deflated, [3], dtype=DType.INT64)
+    with pytest.raises(WireError, match="0 or 1"):
+        unpacked(pack_array(np.array([0, 2], np.uint8)).deflated, [2], dtype=DType.BOOL)
+    with pytest.raises(WireError, match="shape"):
+        unpack_array(
+            pack_array(np.zeros(3)), "numbers", dtypes=(DType.FLOAT64,), shape=(3, 1), max_elements=9
+        )
+
+
+@pytest.mark.parametrize("shape", [[1001], [2**31 - 1], [2**31 - 1] * 4])
+def test_no_more_is_inflated_than_the_limit(shape: list[int]) -> None:
+    with pytest.raises(WireError, match="limit is 1000") as caught:
+        unpacked(STREAM, shape)
+    assert caught.value.code is ErrorCode.TOO_LARGE
+
+
+def test_a_bomb_is_not_inflated() -> None:
+    bomb = zlib.compress(bytes(2**28), 9)
+    tracemalloc.start()
+    try:
+        with pytest.raises(WireError, match="does not end"):
+            unpacked(bomb, [8])
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert peak < 2**20

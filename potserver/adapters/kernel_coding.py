@@ -1,0 +1,97 @@
+"""Kernels for `q/tiles`: what many of them share is said once, and only where the very same numbers come back."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from potschemas import messages
+from potschemas.wire import pack_array
+from potserver.domain.types import Float32, Float64, KernelSet
+
+_BYTES_OF_SHAPE = 5 * 4  # hinge_var, gamma_shape, gamma_rate
+_BYTES_OF_LATTICE = 4 * 8
+_CELL_LIMIT = 2.0**31  # far beyond a tile; every float64 below is exact
+_LEAST_ON_LATTICE = 4  # kernels: of fewer, the hinges themselves are shorter than a lattice
+
+
+def code_kernels(kernels: KernelSet, spacings_m: Sequence[float]) -> messages.CodedKernels:
+    """Kernels, relative to the corners of their tiles, for the wire.
+
+    Shapes travel as a table of the distinct ones where that is shorter, and then hinges as numbers of lattice cells where they
+    lie on a lattice. Both are compared bit by bit with the float32 numbers that they stand for.
+
+    Args:
+        kernels: Hinges relative to the lower corners of their tiles.
+        spacings_m: Lattices to try.
+    """
+    hinge = kernels.hinge_mean.astype(np.float32)
+    shapes = np.column_stack([kernels.hinge_var, kernels.gamma_shape, kernels.gamma_rate])
+    lattices = np.zeros((len(hinge), 4))
+    cells = np.zeros((len(hinge), 3), np.int64)
+    first, kind = _distinct_rows(shapes)
+    is_coded = len(first) * (_BYTES_OF_SHAPE + _BYTES_OF_LATTICE) + len(hinge) < len(hinge) * _BYTES_OF_SHAPE
+    if is_coded:
+        shapes, lattices = shapes[first], lattices[first]
+        for number in np.flatnonzero(np.bincount(kind) >= _LEAST_ON_LATTICE):
+            members = np.flatnonzero(kind == number)
+            found = _lattice_of(hinge[members], spacings_m)
+            if found is not None:
+                lattices[number], cells[members] = found
+    on_lattice = lattices[kind, 0] > 0
+    return messages.CodedKernels(
+        kinds=pack_array(shapes.T),
+        lattices=pack_array(lattices.T),
+        kind=pack_array(_small(kind)) if is_coded else None,
+        cells=pack_array(_small(cells[on_lattice].T)),
+        hinge_mean=pack_array(hinge[~on_lattice].T),
+        weight_mean=pack_array(kernels.weight_mean),
+        weight_var=pack_array(kernels.weight_var),
+    )
+
+
+def _distinct_rows(rows: Float32) -> tuple[NDArray[np.intp], NDArray[np.int64]]:
+    """Where each distinct row stands first, and for each row, which of the distinct ones it is; compared bit by bit."""
+    number = np.zeros(len(rows), np.int64)
+    first = np.zeros(min(len(rows), 1), np.intp)
+    for column in _bits(rows.T):
+        values, place = np.unique(column, return_inverse=True)
+        if len(values) > 1:
+            _, first, number = np.unique(number * len(values) + place, return_index=True, return_inverse=True)
+    return first, number
+
+
+def _lattice_of(hinge: Float32, spacings_m: Sequence[float]) -> tuple[Float64, NDArray[np.int64]] | None:
+    """Spacing and offsets, (4,) m, of a lattice that gives exactly these (K, 3) hinges, and their cells; None without one."""
+    for spacing in spacings_m:
+        axes = [found for axis in hinge.T if (found := _cells_along(axis, spacing)) is not None]
+        if len(axes) == 3:
+            offsets, cells = zip(*axes, strict=True)
+            return np.array([spacing, *offsets]), np.stack(cells, axis=1)
+    return None
+
+
+def _cells_along(axis: Float32, spacing: float) -> tuple[float, NDArray[np.int64]] | None:
+    """Offset and cells that give exactly these (K,) coordinates: centres of cells, or the one height of a planar map."""
+    wide = axis.astype(np.float64)
+    for offset in (0.5 * spacing, float(wide[0])):
+        cells = np.rint((wide - offset) / spacing)
+        if (
+            np.abs(cells).max() < _CELL_LIMIT
+            and (_bits((offset + cells * spacing).astype(np.float32)) == _bits(axis)).all()
+        ):
+            return offset, cells.astype(np.int64)
+    return None
+
+
+def _bits(values: Float32) -> NDArray[np.uint32]:
+    """What tells -0 from 0, and is the same only where nothing was lost."""
+    return np.ascontiguousarray(values).view(np.uint32)
+
+
+def _small(numbers: NDArray[np.int64]) -> NDArray[np.uint8] | NDArray[np.int64]:
+    """As bytes where they fit."""
+    fits = numbers.min(initial=0) >= 0 and numbers.max(initial=0) <= 255
+    return numbers.astype(np.uint8) if fits else numbers

@@ -1,0 +1,269 @@
+"""A mirror of a real server's map: what changed is all that travels, and the copy says what the server says."""
+
+from __future__ import annotations
+
+import json
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from potclient import KernelSet, MapClient
+from potclient.cli import main
+from potclient.errors import NoServerError, UsageError
+from potschemas import messages, wire
+from potschemas.messages import ErrorCode
+from potserver.config import load_settings
+from potserver.server import MapServer
+
+from .conftest import Client, make_cloud, until
+from .fake_server import free_port
+
+POINTS = np.random.default_rng(0).uniform([-8, -7, -2], [38, 7, 3], (400, 3))
+SETTINGS = {
+    "mapping.max_range_m": 12.0,
+    "mapping.beams_per_scan": 600,
+    "queries.tiles_part_kernels": 300,
+}
+
+
+class Site:
+    """A server that may be restarted at its endpoint, and a client of it."""
+
+    def __init__(self, stack: ExitStack) -> None:
+        self._stack = stack
+        self.endpoint = f"tcp/127.0.0.1:{free_port()}"
+        self.server = self.start()
+        self.client = stack.enter_context(MapClient(self.endpoint, timeout_s=30.0))
+        self.client.wait_ready(30.0)
+        self._n = 0
+
+    def start(self) -> MapServer:
+        server = MapServer(load_settings(overrides=SETTINGS), listen=self.endpoint)
+        server.start()
+        self._stack.callback(server.stop)
+        return server
+
+    def scan(self, x_m: float = 0.0) -> None:
+        """A small room around a place on the x axis enters the map."""
+        cloud = make_cloud()
+        pose = np.eye(4)
+        pose[0, 3] = x_m
+        points = wire.decode_array(cloud.points, "points", dtypes=(messages.DType.FLOAT32,), shape=(None, 3))
+        self._n += 1
+        self.client.integrate(points, pose, stamp_ns=self._n * 1_000_000_000)
+
+    def tiles(self) -> dict[tuple[int, int, int], int]:
+        """The revision of each tile with kernels, as the server has it."""
+        mapper: Any = self.server.mapper("default")
+        tiled = mapper.state.tiled
+        return {} if tiled is None else {i: t.revision for i, t in tiled.tiles.items() if len(t.kernels)}
+
+
+@pytest.fixture
+def site() -> Iterator[Site]:
+    with ExitStack() as stack:
+        yield Site(stack)
+
+
+def assert_says_what_the_server_says(mirror: Any, client: MapClient, points: Any = POINTS) -> None:
+    here, there = mirror.occupancy(points), client.occupancy(points)
+    assert here.revision == there.revision
+    np.testing.assert_allclose(here.mean, there.mean, atol=1e-4)
+    np.testing.assert_allclose(here.var, there.var, atol=1e-4)
+    assert (
+        here.observed != there.observed
+    ).mean() < 0.01  # the server leaves out what is far below the threshold
+
+
+def test_updates_carry_the_tiles_that_changed_and_no_others(site: Site) -> None:
+    mirror = site.client.mirror()
+    assert mirror.update().n_kernels == 0
+    site.scan()
+    first = mirror.update()
+    assert (first.n_tiles, first.revision) == (len(site.tiles()), 1)
+    assert len(mirror.kernels) == first.n_kernels > 300, "in several parts"
+    assert_says_what_the_server_says(mirror, site.client)
+    before = site.tiles()
+
+    site.scan(30.0)  # 30 m away: another room, of other tiles
+    second = mirror.update()
+    changed = {index for index, revision in site.tiles().items() if before.get(index) != revision}
+    assert second.n_tiles == len(changed) < len(site.tiles())
+    assert second.n_kernels < len(mirror.kernels)
+    assert second.n_bytes < 20 * second.n_kernels
+    assert_says_what_the_server_says(mirror, site.client)
+    assert mirror.update().is_empty
+
+    whole = site.client.params()
+    order, same = (np.lexsort(kernels.hinge_mean.round(4).T) for kernels in (whole, mirror.kernels))
+    for name in ("gamma_shape", "gamma_rate", "hinge_var", "weight_mean", "weight_var"):
+        np.testing.assert_array_equal(getattr(whole, name)[order], getattr(mirror.kernels, name)[same])
+
+
+def test_a_box_is_mirrored_so_that_answers_in_it_are_the_map_s(site: Site) -> None:
+    site.scan()
+    site.scan(30.0)
+    mirror = site.client.mirror([-4, -4, -1], [4, 4, 2])
+    assert mirror.update().n_tiles < len(site.tiles())
+    inside = np.random.default_rng(1).uniform([-4, -4, -1], [4, 4, 2], (300, 3))
+    assert_says_what_the_server_says(mirror, site.client, inside)
+    assert not mirror.occupancy([[30.0, 6.0, 0.0]]).observed.any()
+
+
+def test_rounded_weights_take_fewer_bytes_and_say_nearly_the_same(site: Site) -> None:
+    site.scan()
+    exact, short = site.client.mirror(), site.client.mirror(mantissa_bits=7)
+    assert short.update().n_bytes < 0.7 * exact.update().n_bytes
+    change = np.abs(short.occupancy(POINTS).mean - exact.occupancy(POINTS).mean)
+    assert 0 < change.max() < 0.02
+
+
+def test_clear_and_restart_begin_another_epoch(site: Site) -> None:
+    site.scan()
+    mirror = site.client.mirror()
+    first = mirror.update()
+    site.client.control("clear")
+    cleared = mirror.update()
+    assert (cleared.is_whole, cleared.n_removed, len(mirror.kernels)) == (True, first.n_tiles, 0)
+    site.scan()
+    assert not mirror.update().is_whole
+
+    site.server.stop()
+    held = mirror.kernels
+    with pytest.raises(NoServerError):
+        mirror.update()
+    assert mirror.kernels is held, "it answers on while the server is away"
+    site.server = site.start()
+    site.client.wait_ready(30.0)
+    restarted = mirror.update()
+    assert restarted.is_whole
+    assert len({first.epoch, cleared.epoch, restarted.epoch}) == 3
+    assert restarted.revision == 0
+    site.scan()
+    mirror.update()
+    assert_says_what_the_server_says(mirror, site.client)
+
+
+def test_an_update_while_the_map_changes_is_of_one_revision(site: Site) -> None:
+    """What is sent of a tile is what that revision had, whatever the writer does meanwhile."""
+    mapper: Any = site.server.mapper("default")
+    states = {}
+    site.scan()
+    states[1] = mapper.state
+    done = threading.Event()
+
+    def drive() -> None:
+        for step in range(1, 6):
+            site.scan(3.0 * step)
+            states[step + 1] = mapper.state
+        done.set()
+
+    thread = threading.Thread(target=drive)
+    thread.start()
+    mirror = site.client.mirror()
+    seen: dict[int, KernelSet] = {}
+    is_last = False
+    while not is_last:
+        is_last = done.is_set()
+        update = mirror.update()
+        seen[update.revision] = mirror.kernels
+    thread.join()
+    assert len(seen) >= 2
+    for revision, kernels in seen.items():
+        expected = np.sort(states[revision].snapshot.kernels.weight_mean)
+        np.testing.assert_array_equal(np.sort(kernels.weight_mean), expected)
+
+
+@pytest.mark.parametrize(
+    ("query", "code"),
+    [
+        (messages.TilesQuery(known=wire.pack_array(np.zeros((4, 1), np.int64))), ErrorCode.BAD_MESSAGE),
+        (
+            messages.TilesQuery(epoch=1, known=wire.pack_array(np.zeros((4, 100_001), np.int64))),
+            ErrorCode.TOO_LARGE,
+        ),
+        (
+            messages.TilesQuery(epoch=1, known=wire.pack_array(np.zeros((3, 1), np.int64))),
+            ErrorCode.BAD_ARRAY,
+        ),
+        (messages.TilesQuery(epoch=1, known=wire.pack_array(np.zeros((4, 1)))), ErrorCode.BAD_ARRAY),
+        (
+            messages.TilesQuery(
+                epoch=1,
+                known=messages.Packed(dtype=messages.DType.INT64, shape=[4, 2], deflated=b"\x78\x9c\x00"),
+            ),
+            ErrorCode.BAD_ARRAY,
+        ),
+        (messages.TilesQuery(lower=[1e9, 0.0, 0.0]), ErrorCode.OUT_OF_RANGE),
+        (messages.TilesQuery(mantissa_bits=1), ErrorCode.BAD_MESSAGE),
+        (messages.TilesQuery(deadline_ms=1e-6), ErrorCode.DEADLINE),
+    ],
+)
+def test_bad_questions_are_refused(real_client: Client, query: messages.TilesQuery, code: ErrorCode) -> None:
+    error = real_client.error("tiles", query)
+    assert error.code is code
+    assert error.message
+
+
+def test_the_limit_of_known_tiles_is_told(real_client: Client) -> None:
+    assert real_client.one("info").limits.max_query_tiles == 100_000
+
+
+def test_the_client_refuses_what_makes_no_sense(site: Site) -> None:
+    for arguments in ({"lower": [0, 0, 0]}, {"margin_m": -1.0}, {"mantissa_bits": 24}):
+        with pytest.raises(UsageError):
+            site.client.mirror(**arguments)
+
+
+# --- the command ---------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def run(site: Site, capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str, str]]:
+    def command(*words: str) -> tuple[int, str, str]:
+        status = main(["mirror", *words, "-e", site.endpoint])
+        captured = capsys.readouterr()
+        return status, captured.out, captured.err
+
+    return command
+
+
+def test_mirror_once_saves_the_map(site: Site, run: Any, tmp_path: Path) -> None:
+    site.scan()
+    status, out, err = run("--once", "-o", str(tmp_path / "map.npz"))
+    saved = KernelSet.load(tmp_path / "map.npz")
+    assert status == 0
+    assert f"{len(saved)} kernels" in out
+    assert "all anew" in out
+    assert "wrote" in err
+    assert saved.map_revision == 1
+    assert len(saved) == len(site.client.params())
+
+
+def test_mirror_follows_the_map(site: Site, run: Any) -> None:
+    site.scan()
+
+    def drive() -> None:
+        until(lambda: site.client.stats().counters.get("queries.tiles.ok"), "the first update")
+        site.scan(30.0)
+
+    thread = threading.Thread(target=drive)
+    thread.start()
+    status, out, _ = run("--updates", "2", "--json", "--seconds", "60")
+    thread.join()
+    first, second = map(json.loads, out.splitlines())
+    assert status == 0
+    assert (first["revision"], first["is_whole"], first["n_kernels"]) == (1, True, first["held_kernels"])
+    assert (second["revision"], second["is_whole"]) == (2, False)
+    assert 0 < second["n_kernels"] < second["held_kernels"]
+    assert second["ms"] > 0
+
+
+def test_mirror_without_a_server_says_so(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["mirror", "--once", "-e", f"tcp/127.0.0.1:{free_port()}"]) == 1
+    assert "no" in capsys.readouterr().err

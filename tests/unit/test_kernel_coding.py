@@ -1,0 +1,109 @@
+"""Kernels for `q/tiles`: short where they share something, and always the same numbers."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from potclient.kernels import KernelSet as ClientKernels
+from potclient.mirror import MapMirror
+from potschemas import messages
+from potserver.adapters.kernel_coding import code_kernels
+from potserver.domain.types import KernelSet
+from tests.tiled_maps import GRID, asking, free_kernels, lattice_kernels, tiled_state
+
+SPACINGS = (GRID.coarse_m, GRID.fine_m)
+BOTH = KernelSet.concatenate([lattice_kernels(300, spacing_m=GRID.coarse_m), lattice_kernels(500, 1)])
+
+
+def n_bytes(coded: messages.CodedKernels) -> int:
+    fields = [getattr(coded, name) for name in coded.__struct_fields__]
+    return sum(len(field.deflated) for field in fields if field is not None)
+
+
+def sent(kernels: KernelSet, index: tuple[int, int, int] = (0, 0, 0)) -> ClientKernels:
+    """What a client holds of one tile of these kernels."""
+    mirror = MapMirror(asking(lambda: tiled_state({index: (kernels, 1)})))
+    mirror.update()
+    return mirror.kernels
+
+
+def assert_same(arrived: ClientKernels, kernels: KernelSet) -> None:
+    np.testing.assert_array_equal(arrived.hinge_mean, kernels.hinge_mean.astype(np.float32))
+    for name in ("hinge_var", "gamma_shape", "gamma_rate", "weight_mean", "weight_var"):
+        array = getattr(arrived, name)
+        assert array.dtype == np.float32
+        assert array.tobytes() == getattr(kernels, name).tobytes(), name  # -0 too
+
+
+@pytest.mark.parametrize(
+    "kernels",
+    [
+        BOTH,
+        free_kernels(200),
+        KernelSet.concatenate([BOTH, free_kernels(200)]),
+        lattice_kernels(100, planar=True),
+        lattice_kernels(1),
+        free_kernels(3),
+    ],
+    ids=["two lattices", "nothing shared", "both kinds", "planar", "one", "three"],
+)
+def test_the_very_same_numbers_arrive(kernels: KernelSet) -> None:
+    assert_same(sent(kernels), kernels)
+
+
+def test_what_is_shared_is_said_once() -> None:
+    coded = code_kernels(BOTH, SPACINGS)
+    assert coded.kinds.shape == [5, 2]
+    assert coded.cells.shape == [3, len(BOTH)]
+    assert coded.cells.dtype is messages.DType.UINT8
+    assert coded.hinge_mean.shape == [3, 0]
+    assert n_bytes(coded) < 11 * len(BOTH)  # plain, it is 40 bytes a kernel
+
+
+def test_kernels_that_share_nothing_are_sent_as_they_are() -> None:
+    coded = code_kernels(free_kernels(200), SPACINGS)
+    assert coded.kind is None
+    assert coded.kinds.shape == [5, 200]
+    assert coded.hinge_mean.shape == [3, 200]
+    assert n_bytes(coded) < 40 * 200 + 7 * 20  # no more than plain, but for the frames of the streams
+
+
+def test_hinges_just_off_the_lattice_are_not_forced_onto_it() -> None:
+    kernels = lattice_kernels(50)
+    moved = kernels.hinge_mean.copy()
+    moved[7, 1] = np.nextafter(np.float32(moved[7, 1]), np.float32(99))
+    kernels = kernels.replace(hinge_mean=moved)
+    assert code_kernels(kernels, SPACINGS).hinge_mean.shape == [3, len(kernels)]
+    assert_same(sent(kernels), kernels)
+
+
+def test_kernels_a_tile_beyond_the_corner_are_on_the_lattice_too() -> None:
+    """Rounding may leave a kernel just outside its tile."""
+    kernels = lattice_kernels(60).moved(np.array([-GRID.fine_m, 0.0, 0.0]))
+    coded = code_kernels(kernels, SPACINGS)
+    assert coded.cells.dtype is messages.DType.INT64
+    assert_same(sent(kernels), kernels)
+
+
+def test_minus_zero_is_not_zero() -> None:
+    kernels = lattice_kernels(60)
+    var = np.zeros((len(kernels), 3), np.float32)
+    var[::2] = -0.0
+    kernels = kernels.replace(hinge_var=var, weight_mean=np.full(len(kernels), -0.0, np.float32))
+    assert code_kernels(kernels, SPACINGS).kinds.shape == [5, 2]
+    assert_same(sent(kernels), kernels)
+
+
+def test_hinges_far_beyond_any_tile_are_sent_as_they_are() -> None:
+    kernels = lattice_kernels(60)
+    kernels = kernels.replace(hinge_mean=kernels.hinge_mean * 1e12)
+    assert code_kernels(kernels, SPACINGS).hinge_mean.shape == [3, len(kernels)]
+    assert_same(sent(kernels), kernels)
+
+
+def test_a_tile_at_utm_coordinates_loses_nothing() -> None:
+    index = (62_500, 675_000, 1)  # 500 km east, 5,400 km north
+    arrived = sent(BOTH, index)
+    there = BOTH.hinge_mean.astype(np.float32).astype(np.float64) + np.array(index) * GRID.size_m
+    np.testing.assert_array_equal(arrived.hinge_mean, there)
