@@ -304,10 +304,10 @@ def test_watch_prints_what_happens(run: Run, server: FakeServer) -> None:
     events = threading.Thread(target=happen, daemon=True)
     events.start()
     try:
-        status, out, _ = run("watch", "--events", "20")
+        status, out, _ = run("watch", "--events", "200")
         assert status == 0
-        assert len(out.splitlines()) == 20
-        status, lines, _ = run("watch", "--events", "20", "--json", "--no-stats")
+        assert len(out.splitlines()) == 200
+        status, lines, _ = run("watch", "--events", "200", "--json", "--no-stats")
     finally:
         ended.set()
         events.join()
