@@ -24,4 +24,5 @@ WORKDIR /var/lib/potserver
 EXPOSE 7447
 HEALTHCHECK --interval=10s --timeout=5s --start-period=60s CMD ["potclient", "info", "-e", "tcp/127.0.0.1:7447"]
 ENTRYPOINT ["potserver"]
-CMD ["serve", "-l", "tcp/0.0.0.0:7447"]
+# /var/lib/potserver/maps outlives the container if a volume lies there
+CMD ["serve", "-l", "tcp/0.0.0.0:7447", "--store", "/var/lib/potserver/maps"]

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any, TextIO
 
 import zenoh
 
+from potclient import cli as client_cli
 from potschemas import __version__
 from potserver.adapters.log import configure_logging, get_logger
 from potserver.config import Settings, as_tree, load_settings, to_toml
@@ -40,6 +41,8 @@ Serve maps to robots and planners over Eclipse Zenoh.
 
 The server listens on tcp/127.0.0.1:7447 only. It needs no router: robots connect to it in client mode.
 It is ready when it logs server_started, and when its liveliness token is up.
+Its maps survive restarts and crashes: every accepted cloud is on the disk before its receipt. server_started says
+where they are kept (--store) and how many clouds each holds; one server a store.
 Anyone who reaches the port may write: use Zenoh's access control and TLS.
 SIGTERM or Ctrl-C drains it: waiting clouds are mapped, everybody gets an answer, exit code 0. A second one
 ends it at once."""
@@ -50,6 +53,7 @@ examples:
   potserver serve --listen tcp/0.0.0.0:7447              for the network: who reaches the port may write
   potserver serve --map ground --map first_floor         two maps, each with its own writer
   potserver serve --listen tcp/127.0.0.1:0               any free port; the log says which
+  potserver serve --store /var/lib/site/maps             keep the maps there; --in-memory: forget them at the end
   potserver serve --connect tcp/router:7447 --listen tcp/127.0.0.1:7448
                                                          join a Zenoh router (ROS 2 hosts have one on 7447)
   potserver serve --settings site.toml --set limits.max_cloud_points=100000
@@ -90,6 +94,36 @@ examples:
   potserver atoms build --recipe site.toml -o site.atoms      a recipe: see the README
   potserver atoms build --recipe site.toml -o site.atoms --ray auto
                                                               on a Ray cluster, with recordings at the same paths"""
+
+
+_MAP_INFO = """\
+What is in a saved map (*.map), in one map's folder, or in a whole store: read, checked and counted."""
+
+_MAP_EXPORT = """\
+Write a saved map as a file that other programs read, as `potclient export` does for a served one.
+
+  ply, npz   kernels
+  pgm        a picture of the plane and its YAML, for Nav2's map_server
+  bt         a binary OctoMap"""
+
+_MAP_EXPORT_EXAMPLES = """\
+examples:
+  potserver map export site.map -f ply -o kernels.ply
+  potserver map export site.map -f pgm --resolution 0.05 --band 0.1 1.5 -o map.pgm"""
+
+_MAP_IMPORT = """\
+Make a *.map file. In the folder `saved` of a server's store, `potclient map load NAME` finds it.
+
+  *.bt        a binary OctoMap: its voxels become evidence of a robot named after the file, and kernels are solved
+              on it
+  *.npz       kernels, as `potclient export npz` writes them: they answer as they did, but there is no evidence;
+              only profile `paper` goes on from them
+  DIR, *.map  the last snapshot of a map's folder, or a saved map, written anew"""
+
+_MAP_IMPORT_EXAMPLES = """\
+examples:
+  potserver map import hall.bt -o ~/.local/state/potserver/potserver/saved/hall.map
+  potclient map load hall"""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -263,6 +297,13 @@ def _atoms_build(options: argparse.Namespace) -> int:
     return EXIT_OK
 
 
+def _map(options: argparse.Namespace) -> int:
+    from potserver import map_command  # this loads the numerics
+
+    settings = _settings(options) if options.settings_flags else Settings()
+    return map_command.run(options, settings, _say)
+
+
 def _demo(arguments: list[str]) -> int:
     try:
         demo = importlib.import_module("potserver.demo")
@@ -397,10 +438,56 @@ def _parser() -> argparse.ArgumentParser:
     _add_build_flags(build)
     build.set_defaults(run=_atoms_build)
 
+    maps = commands.add_parser("map", help="see, export and import kept maps", formatter_class=_Formatter)
+    _add_map_commands(maps.add_subparsers(title="commands", metavar="COMMAND", required=True))
+    maps.set_defaults(run=_map)
+
     commands.add_parser(
         "demo", help="map recorded scans through a real server, and score the maps", add_help=False
     )
     return parser
+
+
+def _add_map_commands(commands: Any) -> None:
+    info = commands.add_parser(
+        "info", help="what saved maps or a store hold", description=_MAP_INFO, formatter_class=_Formatter
+    )
+    info.add_argument("path", type=Path, metavar="FILE|DIR")
+    info.add_argument("--json", action="store_true", help="JSON in place of a table")
+    info.set_defaults(map_command="info", settings_flags=False)
+
+    export = commands.add_parser(
+        "export",
+        help="a saved map as a file of another program",
+        description=_MAP_EXPORT,
+        epilog=_MAP_EXPORT_EXAMPLES,
+        formatter_class=_Formatter,
+    )
+    export.add_argument("path", type=Path, metavar="FILE", help="a *.map file, or a map's folder in a store")
+    export.add_argument("-f", "--format", dest="kind", choices=client_cli.EXPORT_KINDS, required=True)
+    client_cli.add_export_flags(export)
+    export.set_defaults(map_command="export", settings_flags=False)
+
+    import_ = commands.add_parser(
+        "import",
+        help="a saved map of what another program, or an old store, knows",
+        description=_MAP_IMPORT,
+        epilog=_MAP_IMPORT_EXAMPLES,
+        formatter_class=_Formatter,
+    )
+    import_.add_argument("path", type=Path, metavar="FILE|DIR")
+    import_.add_argument(
+        "-o", "--out", type=Path, required=True, metavar="FILE", help="the *.map file to write"
+    )
+    import_.add_argument(
+        "--looks",
+        type=float,
+        default=1.0,
+        metavar="X",
+        help="bt: how much its voxels count, in what an OctoMap can count at most [1]",
+    )
+    _add_settings_flags(import_)
+    import_.set_defaults(map_command="import", settings_flags=True)
 
 
 def _add_build_flags(parser: argparse.ArgumentParser) -> None:
@@ -455,6 +542,13 @@ def _add_settings_flags(parser: argparse.ArgumentParser) -> None:
         "--profile", metavar="NAME", help="mapping profile: default, or paper (the authors' choices)"
     )
     server.add_argument("--dictionary", metavar="FILE", help="atom dictionary [the built-in atoms]")
+    store = server.add_mutually_exclusive_group()
+    store.add_argument(
+        "--store",
+        metavar="DIR",
+        help="where the maps survive restarts [$XDG_STATE_HOME/potserver/SERVER_ID, else under ~/.local/state]",
+    )
+    store.add_argument("--in-memory", action="store_true", help="forget the maps at the end")
     server.add_argument(
         "--threads", type=int, metavar="N", help="threads that integrate one scan [all processors]"
     )
@@ -505,6 +599,7 @@ def _settings(options: argparse.Namespace) -> Settings:
             "root": options.root,
             "mapping.profile": options.profile,
             "dictionary": options.dictionary,
+            "store.directory": "" if options.in_memory else options.store,
             "threads": options.threads,
             "drain_timeout_s": options.drain_timeout,
             "log.level": options.log_level,
@@ -522,9 +617,18 @@ def _settings(options: argparse.Namespace) -> Settings:
         overrides.update([_split(assignment, "=", "--set", "KEY=VALUE")])
     settings = load_settings(file=options.settings, environ=os.environ, overrides=overrides)
     cfg = dict(_split(assignment, ":", "--cfg", "KEY:VALUE") for assignment in options.cfg)
+    store = settings.store
+    if store.directory is None:  # nobody said anything: a server of its own keeps its maps
+        store = dataclasses.replace(store, directory=str(_state_folder() / settings.server_id))
     return dataclasses.replace(
-        settings, zenoh=dataclasses.replace(settings.zenoh, cfg={**settings.zenoh.cfg, **cfg})
+        settings, store=store, zenoh=dataclasses.replace(settings.zenoh, cfg={**settings.zenoh.cfg, **cfg})
     )
+
+
+def _state_folder() -> Path:
+    """Where programs of this user keep their state, by the XDG base directory rules: a relative path does not count."""
+    named = Path(os.environ.get("XDG_STATE_HOME", ""))
+    return (named if named.is_absolute() else Path.home() / ".local" / "state") / "potserver"
 
 
 def _split(assignment: str, separator: str, flag: str, form: str) -> tuple[str, str]:

@@ -82,6 +82,19 @@ class AtomSettings:
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class StoreSettings:
+    """Where the maps survive a restart."""
+
+    directory: str | None = (
+        None  # a folder for all maps; none or "": in memory only. `potserver serve` has a default
+    )
+    fsync: bool = True  # wait for the disk with each cloud; else a power cut, though no crash of ours, takes the last ones
+    snapshot_scans: int = 50  # clouds after which the changed tiles are written and the journal begins anew
+    snapshot_bytes: int = 64 * 2**20  # of the journal, likewise
+    max_saved: int = 100  # copies with a name (`potclient map save NAME`); one more is refused
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class LogSettings:
     """What goes to stderr."""
 
@@ -107,6 +120,7 @@ class Settings:
     queries: QuerySettings = dataclasses.field(default_factory=QuerySettings)
     poses: PoseSettings = dataclasses.field(default_factory=PoseSettings)
     atoms: AtomSettings = dataclasses.field(default_factory=AtomSettings)
+    store: StoreSettings = dataclasses.field(default_factory=StoreSettings)
     log: LogSettings = dataclasses.field(default_factory=LogSettings)
     # `mapping.profile` sets what the other keys of the table start from
     mapping: MappingSettings = dataclasses.field(default_factory=MappingSettings)
@@ -313,6 +327,9 @@ def _check(s: Settings) -> None:
                 continue
             least = 0 if field.name in ("wait_s", "retry_after_s") else 1e-9
             need(f"{table}.{field.name}", math.isfinite(value) and value >= least, "a positive number")
+    need("store.snapshot_scans", s.store.snapshot_scans > 0, "at least 1")
+    need("store.snapshot_bytes", s.store.snapshot_bytes > 0, "at least 1")
+    need("store.max_saved", s.store.max_saved >= 0, "at least 0")
     need("seed", s.seed >= 0, "at least 0")
     need("threads", s.threads is None or s.threads > 0, "at least 1")
     need("stats_period_s", 0.01 <= s.stats_period_s < math.inf, "at least 0.01 s")

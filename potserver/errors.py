@@ -122,6 +122,25 @@ class ShuttingDownError(PotserverError):
     retryable = True
 
 
+class StorageError(PotserverError):
+    """The disk did not take what had to be kept: it is full, or broken. Nothing was changed."""
+
+    code = "storage"
+    retryable = True
+
+
+class UnknownMapError(PotserverError):
+    """No map was saved under this name."""
+
+    code = "unknown_map"
+
+
+class MapFileError(PotserverError):
+    """A kept map is damaged, of another format, or does not fit the settings; `reason` says which."""
+
+    code = "map_file"
+
+
 class DictionaryError(PotserverError):
     """An atom dictionary file is missing, damaged, or of another version."""
 

@@ -3,7 +3,7 @@
     with MapServer(Settings(), listen="tcp/127.0.0.1:0") as server:
         client = MapClient(server.endpoint)
 
-Threads, besides Zenoh's own: per map a writer (the only one that changes the map), two outboxes, and one
+Threads, besides Zenoh's own: per map a writer (the only one that changes the map), two outboxes, one for snapshots, and one
 reader for each of clouds, poses, queries, control and robots' tokens; per server the query workers, the stats
 publisher and its queryable.
 """
@@ -16,7 +16,7 @@ import contextlib
 import dataclasses
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import TracebackType
 from typing import Protocol
@@ -28,8 +28,9 @@ from potserver.adapters import codec
 from potserver.adapters.cloud_subscriber import CloudSubscriber
 from potserver.adapters.intake import IntakeQueue
 from potserver.adapters.log import get_logger
+from potserver.adapters.map_store import MapStore, MemoryOnly
 from potserver.adapters.outbox import Outbox
-from potserver.adapters.ports import Asker, Mapper
+from potserver.adapters.ports import Asker, Keeper, Mapper
 from potserver.adapters.pose_subscriber import PoseSubscriber
 from potserver.adapters.poses import PoseBuffer
 from potserver.adapters.presence import RobotWatch, ServerToken
@@ -91,6 +92,7 @@ class MapServer:
         self._nodes: dict[str, _MapNode] = {}
         self._pool: QueryPool | None = None
         self._stats: _StatsPublisher | None = None
+        self._stores: dict[str, MapStore] = {}
         self._stopping = threading.Event()
         self._lock = threading.Lock()  # start and stop, one at a time
         self._stopped_clean: bool | None = None
@@ -103,6 +105,8 @@ class MapServer:
         Raises:
             SettingsError: an endpoint is taken, or the Zenoh configuration is illegal.
             DictionaryError: the dictionary file is missing or damaged.
+            StorageError: another server has the store, or the disk refuses.
+            MapFileError: a kept map is damaged, of another version, or does not fit the settings.
         """
         with self._lock:
             if self._session is not None or self._stopped_clean is not None:
@@ -111,7 +115,14 @@ class MapServer:
             log.info("server_starting", version=__version__, settings=as_tree(s))
             services = {map_id: self._make_map(map_id) for map_id in s.maps}
             config = build_config(s.zenoh, root=s.root, wire_guard_bytes=s.limits.wire_guard_bytes)
-            self._session, self._endpoints = open_session(config)
+            try:
+                stamps = {
+                    map_id: self._open_store(map_id, mapper) for map_id, (mapper, _) in services.items()
+                }
+                self._session, self._endpoints = open_session(config)
+            except BaseException:
+                self._close_stores()
+                raise
             atexit.register(self.stop)  # leaving with Zenoh open would abort the process
             try:
                 started_s = time.perf_counter()
@@ -132,6 +143,8 @@ class MapServer:
                         mapper,
                         asker,
                         atoms,
+                        keeper=self._stores.get(map_id, MemoryOnly()),
+                        last_stamps=stamps[map_id],
                         session=self._session,
                         pool=self._pool,
                         health=self.health,
@@ -143,7 +156,13 @@ class MapServer:
             except BaseException:
                 self._teardown(0.0)
                 raise
-            log.info("server_started", server_id=s.server_id, endpoints=self._endpoints, maps=list(s.maps))
+            log.info(
+                "server_started",
+                server_id=s.server_id,
+                endpoints=self._endpoints,
+                maps={map_id: mapper.n_scans for map_id, (mapper, _) in services.items()},
+                store=s.store.directory or "memory only",
+            )
 
     def stop(self, drain_timeout_s: float | None = None) -> bool:
         """Take no more clouds, map those that wait, answer everybody, and close. Never hangs; may be called
@@ -222,6 +241,29 @@ class MapServer:
             },
         )
 
+    def _open_store(self, map_id: str, mapper: Mapper) -> dict[str, int]:
+        """Give a map what was kept of it; the newest stamps of its robots."""
+        s = self.settings.store
+        if not s.directory:
+            return {}
+        store = MapStore(
+            Path(s.directory).expanduser(),
+            map_id,
+            keeps_evidence=mapper.settings.refine,
+            health=self.health,
+            fsync=s.fsync,
+            snapshot_scans=s.snapshot_scans,
+            snapshot_bytes=s.snapshot_bytes,
+            max_saved=s.max_saved,
+        )
+        self._stores[map_id] = store
+        return store.restore(mapper).stamps
+
+    def _close_stores(self) -> bool:
+        stores, self._stores = self._stores, {}
+        closed = [store.close() for store in stores.values()]  # all of them, whatever the first says
+        return all(closed)
+
     def _teardown(self, drain_timeout_s: float) -> bool:
         session = self._session
         if session is None:
@@ -240,7 +282,8 @@ class MapServer:
         if self._stats is not None:
             self._stats.close()
         ended = [node.close() for node in nodes]
-        clean = all([*drained, answered, *ended, close_session(session, _CLOSE_S)])
+        kept = self._close_stores()  # after the writers: a last snapshot of what they made
+        clean = all([*drained, answered, *ended, kept, close_session(session, _CLOSE_S)])
         self._session = None
         log.info("server_stopped", clean=clean, counters=self.health.counters())
         return clean
@@ -256,6 +299,8 @@ class _MapNode:
         asker: Asker,
         atoms: AtomStore,
         *,
+        keeper: Keeper,
+        last_stamps: Mapping[str, int],
         session: zenoh.Session,
         pool: QueryPool,
         health: Health,
@@ -295,6 +340,8 @@ class _MapNode:
         self._writer = MapWriter(
             map_id,
             mapper=mapper,
+            keeper=keeper,
+            last_stamps=last_stamps,
             intake=self.intake,
             receipts=self._receipts,
             poses=poses,
@@ -321,6 +368,7 @@ class _MapNode:
                 max_range_m=mapper.settings.max_range_m,
                 limits=s.limits,
                 started_ns=health.started_ns,
+                durable=keeper.durable,
             )
 
         self.robots = RobotWatch(session, self._keys, health=health, max_robots=s.limits.max_robots)
@@ -357,7 +405,7 @@ class _MapNode:
                 self._keys,
                 mapper=mapper,
                 intake=self.intake,
-                clear=self._writer.clear,
+                writer=self._writer,
                 withdraw=self.withdraw,
                 prompt=self.prompt,
                 health=health,

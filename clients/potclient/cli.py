@@ -1,4 +1,4 @@
-"""`potclient publish | query | grid | rays | risk | export | mirror | watch | load | info | atoms | control | town`."""
+"""`potclient publish | query | grid | rays | risk | export | mirror | watch | load | info | atoms | map | town`."""
 
 from __future__ import annotations
 
@@ -34,9 +34,10 @@ from potclient.files import save_npz
 from potclient.holdout import HoldOut
 from potclient.session import DEFAULT_ENDPOINT, add_zenoh_arguments, options_from_arguments
 from potschemas import __version__, messages
-from potschemas.keys import DEFAULT_ROOT
+from potschemas.keys import CONTROL_VERBS, DEFAULT_ROOT
 
 if TYPE_CHECKING:
+    from potclient.export import MapSource
     from potclient.loadtest import LoadReport
     from potclient.metrics import Metrics
     from potclient.mirror import MapMirror, MirrorUpdate
@@ -45,6 +46,7 @@ if TYPE_CHECKING:
 _POLL_S = (
     2.0  # `mirror` asks so often even if nothing was announced: a server that was restarted announces nothing
 )
+EXPORT_KINDS = ("ply", "npz", "pgm", "bt")
 EXIT_OK, EXIT_FAILED, EXIT_USAGE, EXIT_INTERRUPTED = 0, 1, 2, 130
 
 
@@ -82,6 +84,7 @@ def build_parser() -> argparse.ArgumentParser:
   potclient rays 0 0 1 --max-range 20             how far one can see from there, all around
   potclient export bt -o map.bt --resolution 0.2  the map for programs that read OctoMap files
   potclient mirror                                follow the map by what changes
+  potclient map save before-the-rain              a copy of the map, to go back to
   potclient load --robots 8 --planners 4          how much the server takes
 
 `potclient COMMAND --help` explains each command.""",
@@ -100,7 +103,7 @@ def build_parser() -> argparse.ArgumentParser:
     _add_load(commands)
     _add_info(commands)
     _add_atoms(commands)
-    _add_control(commands)
+    _add_map(commands)
     _add_town(commands)
     return parser
 
@@ -696,7 +699,13 @@ For pgm, --band says which heights matter to the robot; a map without height nee
   potclient export pgm --resolution 0.05 --band 0.1 1.5 -o map.pgm
   potclient export bt --resolution 0.2 --lower -20 -20 -1 --upper 20 20 4 -o map.bt""",
     )
-    parser.add_argument("kind", choices=("ply", "npz", "pgm", "bt"))
+    parser.add_argument("kind", choices=EXPORT_KINDS)
+    add_export_flags(parser)
+    parser.set_defaults(timeout=60.0)
+
+
+def add_export_flags(parser: argparse.ArgumentParser) -> None:
+    """The flags that say what of a map goes into a file, and how; `export_map` reads them."""
     parser.add_argument("-o", "--out", type=Path, required=True, metavar="FILE", help="file to write")
     _add_box_arguments(parser, "corner of the box (default: the map's)")
     parser.add_argument("--resolution", type=_positive, metavar="METRES", help="pgm, bt: cell edge")
@@ -708,12 +717,20 @@ For pgm, --band says which heights matter to the robot; a map without height nee
     )
     parser.add_argument("--free", type=float, metavar="P", help="free below (default: pgm 0.25, bt 0.5)")
     parser.add_argument("-q", "--quiet", action="store_true", help="no progress bar")
-    parser.set_defaults(timeout=60.0)
 
 
 def _export(arguments: argparse.Namespace) -> int:
-    from potclient import export
+    check_export_flags(arguments)
+    with _client(arguments) as client:
+        return export_map(client, arguments)
 
+
+def check_export_flags(arguments: argparse.Namespace) -> None:
+    """Refuse flags that mean nothing for the kind of file, before anything is opened.
+
+    Raises:
+        UsageError: a flag is missing, or one too many.
+    """
     is_grid = arguments.kind in ("pgm", "bt")
     if is_grid and arguments.resolution is None:
         raise UsageError(f"export {arguments.kind}: give --resolution METRES")
@@ -722,17 +739,23 @@ def _export(arguments: argparse.Namespace) -> int:
         raise UsageError(f"export {arguments.kind}: kernels have no cells; only --lower and --upper apply")
     if arguments.kind == "bt" and arguments.band is not None:
         raise UsageError("export bt: --band is for pgm; give the heights with --lower and --upper")
-    with _client(arguments) as client, _part_bar(arguments.quiet) as progress:
-        if is_grid:
-            box = _export_box(arguments, client)
+
+
+def export_map(source: MapSource, arguments: argparse.Namespace) -> int:
+    """Write a map as the flags want it, and say what was written."""
+    from potclient import export
+
+    with _part_bar(arguments.quiet) as progress:
+        if arguments.kind in ("pgm", "bt"):
+            box = _export_box(arguments, source)
             run = export.export_pgm if arguments.kind == "pgm" else export.export_bt
             thresholds = {"occupied_above": arguments.occupied, "free_below": arguments.free}
             given = {name: value for name, value in thresholds.items() if value is not None}
-            done = run(client, arguments.out, box, progress=progress, **given)
+            done = run(source, arguments.out, box, progress=progress, **given)
         else:
             write = export.export_ply if arguments.kind == "ply" else export.export_npz
             done = write(
-                client, arguments.out, lower=arguments.lower, upper=arguments.upper, progress=progress
+                source, arguments.out, lower=arguments.lower, upper=arguments.upper, progress=progress
             )
     what = {"ply": "kernels", "npz": "kernels", "pgm": "pixels", "bt": "voxels"}[arguments.kind]
     _say(f"wrote {arguments.out}: {done.n} {what}, revision {done.revisions[0] if done.revisions else 0}")
@@ -743,12 +766,12 @@ def _export(arguments: argparse.Namespace) -> int:
     return EXIT_OK
 
 
-def _export_box(arguments: argparse.Namespace, client: MapClient) -> Any:
+def _export_box(arguments: argparse.Namespace, source: MapSource) -> Any:
     from potclient.export import CellBox, bounds_of
 
     lower, upper = arguments.lower, arguments.upper
     if lower is None or upper is None:
-        low, high = bounds_of(client)
+        low, high = bounds_of(source)
         lower = low.tolist() if lower is None else lower
         upper = high.tolist() if upper is None else upper
     if arguments.kind == "pgm":
@@ -1041,7 +1064,7 @@ def _say_load(report: LoadReport) -> None:
     _say(f"\n{report.elapsed_s:.1f} s, {rate:.1f} clouds/s integrated, {answers:.1f} answers/s: {verdict}")
 
 
-# --- info, atoms, control ------------------------------------------------------------------------------------------
+# --- info, atoms, map ----------------------------------------------------------------------------------------------
 
 
 def _add_info(commands: Any) -> None:
@@ -1160,21 +1183,36 @@ def _say_atoms(atoms: list[messages.AtomInfo]) -> None:
     _say(_table(heads, rows))
 
 
-def _add_control(commands: Any) -> None:
+def _add_map(commands: Any) -> None:
     parser = _command(
         commands,
-        "control",
-        _control,
-        help="carry out a control verb: clear, drain",
-        description="Carry out a control verb on the map; the server says which it has.",
-        epilog="examples:\n  potclient control clear",
+        "map",
+        _map,
+        help="the map as a whole: save, load, clear, drain",
+        description="""Have the server save its map, load a saved one, forget everything, or finish its queue and take no
+more clouds. Each comes after all clouds that the server has taken before it.
+
+What a server keeps survives its restarts by itself. `save NAME` makes a copy beside that, in the folder `saved` of the
+server's store, which `load NAME` puts in the place of the present map.""",
+        epilog="""examples:
+  potclient map save                    write everything to the disk now
+  potclient map save before-the-rain    and a copy with a name
+  potclient map load before-the-rain    go back to it: what came since is gone
+  potclient map clear                   forget everything
+  potclient map drain                   before the server is replaced""",
     )
-    parser.add_argument("verb", help="e.g. clear")
+    parser.add_argument("verb", choices=CONTROL_VERBS, help="what to do")
+    parser.add_argument("name", nargs="?", metavar="NAME", help="of a saved map, for save and load")
 
 
-def _control(arguments: argparse.Namespace) -> int:
+def _map(arguments: argparse.Namespace) -> int:
+    verb, name = arguments.verb, arguments.name
+    if verb == "load" and name is None:
+        raise UsageError("map: load which? name a saved map")
+    if name is not None and verb not in ("save", "load"):
+        raise UsageError(f"map: {verb} takes no name")
     with _client(arguments) as client:
-        reply = client.control(arguments.verb)
+        reply = client.control(verb, name=name)
     _say(f"{reply.verb}: {reply.message} (revision {reply.map_revision})")
     return EXIT_OK
 

@@ -874,15 +874,46 @@ class MapClient:
         )
         return _decode(sample.payload, messages.Stats)
 
-    def control(self, verb: str, *, timeout_s: float | None = None) -> messages.ControlReply:
-        """Carry out a control verb: clear, drain.
+    def save(self, name: str | None = None, *, timeout_s: float | None = None) -> messages.ControlReply:
+        """Have the server write its map to the disk now, all clouds sent so far included.
 
+        Args:
+            name: Write also a file of its own, from which `load` gets the map back; one of that name is replaced.
+            timeout_s: For the answer.
+        Raises:
+            UnsupportedError: the server keeps its maps in memory only.
+            StorageError: its disk did not take it.
+        """
+        return self.control("save", name=name, timeout_s=timeout_s)
+
+    def load(self, name: str, *, timeout_s: float | None = None) -> messages.ControlReply:
+        """Have the server put a saved map in the place of the present one, which is gone then.
+
+        Raises:
+            UnknownMapError: none was saved under that name; the message lists those there are.
+            MapFileError: the file is damaged, of another version, or does not fit the server's settings.
+            UnsupportedError, StorageError: as for `save`. The map is unchanged, as after any error.
+        """
+        return self.control("load", name=name, timeout_s=timeout_s)
+
+    def control(
+        self, verb: str, *, name: str | None = None, timeout_s: float | None = None
+    ) -> messages.ControlReply:
+        """Carry out a control verb: save, load, clear, drain.
+
+        Args:
+            verb: Which.
+            name: Of a saved map, for `save` and `load`.
+            timeout_s: For the answer.
         Raises:
             UnsupportedError: the server has no such verb.
         """
         timeout_s = self._timeout_s if timeout_s is None else timeout_s
         key = self.keys.control(_legal_id(verb, "verb"))
-        sample = next(self._ask_key(key, messages.ControlRequest(timeout_s=timeout_s), timeout_s))
+        request = messages.ControlRequest(
+            timeout_s=timeout_s, name=messages.ABSENT if name is None else _legal_id(name, "name")
+        )
+        sample = next(self._ask_key(key, request, timeout_s))
         return _decode(sample.payload, messages.ControlReply)
 
     # --- streams -------------------------------------------------------------------------------------------------------------

@@ -184,6 +184,25 @@ class ShuttingDownError(MapServerError):
     retryable = True
 
 
+class StorageError(MapServerError):
+    """The server's disk did not take it, and nothing was changed."""
+
+    code = "storage"
+    retryable = True
+
+
+class UnknownMapError(MapServerError):
+    """No map was saved under this name."""
+
+    code = "unknown_map"
+
+
+class MapFileError(MapServerError):
+    """A saved map cannot be used; `reason` says why: `damaged`, `version`, `settings`."""
+
+    code = "map_file"
+
+
 class InternalError(MapServerError):
     """A bug of the server; the traceback is in its log."""
 

@@ -8,17 +8,17 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from potclient.client import MapClient
 from potclient.errors import UsageError
 from potclient.files import whole
 from potclient.kernels import KernelSet
 from potclient.octomap import KEY_ORIGIN, OcTreeBuilder, write_bt
 from potclient.results import Float64, Grid
+from potschemas import messages
 
 Int64 = NDArray[np.int64]
 Progress = Callable[[int, int], None]  # (parts done, parts in all)
@@ -34,6 +34,16 @@ _PLY_FIELDS: tuple[tuple[str, str, str], ...] = (
     *((name, "<f4", "float") for name in ("gamma_shape", "gamma_rate", "weight_mean", "weight_var")),
     *((name, "u1", "uchar") for name in ("red", "green", "blue")),
 )
+
+
+class MapSource(Protocol):
+    """Where files are made from: a `MapClient`, or a map that is not served but answers like one."""
+
+    def info(self) -> messages.Info: ...
+    def params_parts(
+        self, lower: ArrayLike | None = None, upper: ArrayLike | None = None
+    ) -> Iterator[tuple[int, int, KernelSet]]: ...
+    def grid(self, lower: ArrayLike, upper: ArrayLike, resolution: float) -> Grid: ...
 
 
 class Exported(NamedTuple):
@@ -94,7 +104,7 @@ class CellBox(NamedTuple):
 
 
 def export_ply(
-    client: MapClient,
+    source: MapSource,
     path: Path,
     *,
     lower: ArrayLike | None = None,
@@ -112,7 +122,7 @@ def export_ply(
     scalars = ""
     with whole(path) as file:
         file.write(b" " * _PLY_HEADER_BYTES)  # how many there are is known at the end
-        for _, n_parts, kernels in client.params_parts(lower, upper):
+        for _, n_parts, kernels in source.params_parts(lower, upper):
             file.write(_ply_rows(kernels).tobytes())
             n += len(kernels)
             revisions.add(kernels.map_revision)
@@ -135,7 +145,7 @@ def export_ply(
 
 
 def export_npz(
-    client: MapClient,
+    source: MapSource,
     path: Path,
     *,
     lower: ArrayLike | None = None,
@@ -148,7 +158,7 @@ def export_npz(
         PotclientError: see `MapClient.params_parts`; nothing is written then.
     """
     parts: dict[int, KernelSet] = {}
-    for part, n_parts, kernels in client.params_parts(lower, upper):
+    for part, n_parts, kernels in source.params_parts(lower, upper):
         parts[part] = kernels
         if progress is not None:
             progress(len(parts), n_parts)
@@ -158,7 +168,7 @@ def export_npz(
 
 
 def export_pgm(
-    client: MapClient,
+    source: MapSource,
     path: Path,
     box: CellBox,
     *,
@@ -188,7 +198,7 @@ def export_pgm(
     nx, ny, _ = (box.stop - box.first).tolist()
     likeliest = np.full((nx, ny), -1.0, np.float32)  # -1: nothing observed
     revisions = set()
-    for tile, grid in _grids(client, box, progress):
+    for tile, grid in _grids(source, box, progress):
         x, y = (slice(int(tile.first[a] - box.first[a]), int(tile.stop[a] - box.first[a])) for a in (0, 1))
         column = np.where(grid.observed, grid.mean, np.float32(-1)).max(axis=2)
         likeliest[x, y] = np.maximum(likeliest[x, y], column)
@@ -210,7 +220,7 @@ def export_pgm(
 
 
 def export_bt(
-    client: MapClient,
+    source: MapSource,
     path: Path,
     box: CellBox,
     *,
@@ -235,7 +245,7 @@ def export_bt(
         )
     tree = OcTreeBuilder()
     n, revisions = 0, set()
-    for tile, grid in _grids(client, box, progress):
+    for tile, grid in _grids(source, box, progress):
         occupied = grid.observed & (grid.mean >= occupied_above)
         known = occupied | (grid.observed & (grid.mean < free_below))
         tree.add(np.argwhere(known) + tile.first + KEY_ORIGIN, occupied[known])
@@ -245,13 +255,13 @@ def export_bt(
     return Exported(n, tuple(sorted(revisions)))
 
 
-def _grids(client: MapClient, box: CellBox, progress: Progress | None) -> Iterator[tuple[CellBox, Grid]]:
+def _grids(source: MapSource, box: CellBox, progress: Progress | None) -> Iterator[tuple[CellBox, Grid]]:
     """The box, tile by tile."""
-    tiles = box.tiles(min(_TILE_CELLS, client.info().limits.max_grid_cells))
+    tiles = box.tiles(min(_TILE_CELLS, source.info().limits.max_grid_cells))
     for done, tile in enumerate(tiles, 1):
         raised = np.array([0.0, 0.0, box.raised_m])
         lower, upper = (corner * box.resolution + raised for corner in (tile.first, tile.stop))
-        grid = client.grid(lower, upper, box.resolution)
+        grid = source.grid(lower, upper, box.resolution)
         if grid.shape != tuple((tile.stop - tile.first).tolist()):
             raise UsageError(f"a grid of {grid.shape} cells came for {(tile.stop - tile.first).tolist()}")
         yield tile, grid
@@ -280,13 +290,13 @@ def _check_thresholds(occupied_above: float, free_below: float) -> None:
         )
 
 
-def bounds_of(client: MapClient) -> tuple[Float64, Float64]:
+def bounds_of(source: MapSource) -> tuple[Float64, Float64]:
     """The corners of the box of all hinges, m, map frame.
 
     Raises:
         UsageError: the map is empty.
     """
-    info = client.info()
+    info = source.info()
     if info.lower is None or info.upper is None:
         raise UsageError("the map is empty; publish something first, or give --lower and --upper")
     return np.asarray(info.lower, np.float64), np.asarray(info.upper, np.float64)

@@ -39,6 +39,7 @@ from potserver.errors import (
     BadMessageError,
     BadPointsError,
     EmptyError,
+    NoPoseError,
     OutOfRangeError,
     PotserverError,
     ShapeError,
@@ -266,6 +267,34 @@ def decode_cloud(
         T_map_sensor=pose,
         is_planar=is_planar,
     )
+
+
+def encode_cloud(scan: Scan) -> bytes:
+    """The scan as `pot.cloud.v1`, complete: `read_cloud` needs nothing else to make the same scan again."""
+    return wire.encode(
+        messages.Cloud(
+            seq=scan.seq,
+            stamp_ns=scan.stamp_ns,
+            points=wire.encode_array(scan.points[:, :2] if scan.is_planar else scan.points),
+            T_map_sensor=wire.encode_array(scan.T_map_sensor),
+            is_return=None if scan.is_return.all() else wire.encode_array(scan.is_return),
+            robot=scan.robot_id,
+        )
+    )
+
+
+def read_cloud(payload: bytes) -> Scan:
+    """A scan that was accepted before: what limits allow now does not matter.
+
+    Raises:
+        PotserverError: it is no complete cloud.
+    """
+    unlimited = Limits(max_cloud_bytes=2**40, max_cloud_points=2**40, max_coordinate_m=math.inf)
+    return decode_cloud(payload, robot_id=None, limits=unlimited, pose_at=_no_pose)
+
+
+def _no_pose(robot_id: str, _stamp_ns: int) -> Float64:
+    raise NoPoseError(f"the kept cloud of {robot_id} has no pose")
 
 
 @np.errstate(over="ignore", invalid="ignore")
@@ -516,9 +545,21 @@ def decode_stats_query(payload: bytes) -> None:
     _decode(payload, messages.StatsQuery)
 
 
-def decode_control(payload: bytes) -> float | None:
-    """How long the asker waits for a control verb, in seconds."""
-    return _decode(payload, messages.ControlRequest).timeout_s
+class ControlRequest(NamedTuple):
+    """A decoded `ctl/<verb>`."""
+
+    timeout_s: float | None  # how long the asker waits
+    name: str | None  # of a saved map
+
+
+def decode_control(payload: bytes) -> ControlRequest:
+    """How long the asker of a control verb waits, and which saved map is meant.
+
+    Raises:
+        BadMessageError: not that message.
+    """
+    request = _decode(payload, messages.ControlRequest)
+    return ControlRequest(request.timeout_s, None if request.name is messages.ABSENT else request.name)
 
 
 def _decode(payload: bytes, kind: type[MessageT], max_bytes: int = _MAX_SMALL_BYTES) -> MessageT:
@@ -827,6 +868,7 @@ def encode_info(
     max_range_m: float,
     limits: Limits,
     started_ns: int,
+    durable: bool,
 ) -> Wire:
     """What this server is and what this map holds."""
     hinges = snapshot.kernels.hinge_mean
@@ -863,6 +905,7 @@ def encode_info(
                 max_query_tiles=limits.max_query_tiles,
             ),
             started_ns=started_ns,
+            durable=durable,
         )
     )
 

@@ -25,7 +25,14 @@ from potserver.adapters.outbox import Outbox
 from potserver.adapters.ports import Asker, Mapper, RayPlan, RiskPlan
 from potserver.adapters.query_pool import QueryJob, QueryPool
 from potserver.adapters.receipts import ReceiptSender
-from potserver.errors import DeadlineError, PotserverError, ShuttingDownError, UnsupportedError
+from potserver.adapters.writer import MapWriter
+from potserver.errors import (
+    BadMessageError,
+    DeadlineError,
+    PotserverError,
+    ShuttingDownError,
+    UnsupportedError,
+)
 from potserver.services.atom_store import AtomChange, AtomStore
 from potserver.services.health import Health
 
@@ -311,9 +318,7 @@ class MapQueryable:
 
 
 class ControlQueryable:
-    """`ctl/<verb>` of one map: clear and drain. Both follow every cloud that was admitted before them."""
-
-    VERBS = ("clear", "drain")
+    """`ctl/<verb>` of one map. Each follows every cloud that was admitted before it."""
 
     def __init__(
         self,
@@ -322,14 +327,14 @@ class ControlQueryable:
         *,
         mapper: Mapper,
         intake: IntakeQueue,
-        clear: Callable[[], None],
+        writer: MapWriter,
         withdraw: Callable[[], None],
         prompt: Outbox,
         health: Health,
         limits: Limits,
     ) -> None:
         self._keys, self._mapper, self._intake = map_keys, mapper, intake
-        self._clear, self._withdraw = clear, withdraw
+        self._writer, self._withdraw = writer, withdraw
         self._prompt, self._health, self._limits = prompt, health, limits
         self._queryable = session.declare_queryable(
             map_keys.control("*"), zenoh.handlers.FifoChannel(4), complete=True
@@ -338,7 +343,7 @@ class ControlQueryable:
     def run(self) -> None:
         """Admit requests until undeclared, on a thread of our own."""
         for query in self._queryable:
-            verb = _op_of(query, self.VERBS) or "unknown"
+            verb = _op_of(query, keys.CONTROL_VERBS) or "unknown"
             try:
                 self._admit(query, verb)
             except PotserverError as error:
@@ -357,14 +362,18 @@ class ControlQueryable:
                 "control changes a map: name the map and the verb, wildcards are not taken"
             )
         if verb == "unknown":
-            raise UnsupportedError(f"no verb {_last_chunk(query)!r}; there are {', '.join(self.VERBS)}")
+            raise UnsupportedError(
+                f"no verb {_last_chunk(query)!r}; there are {', '.join(keys.CONTROL_VERBS)}"
+            )
         payload = query.payload
         codec.check_size(
             len(payload) if payload is not None else 0, self._limits.max_query_bytes, "control request"
         )
         codec.check_encoding(_encoding(query), messages.ControlRequest)
-        timeout_s = codec.decode_control(payload.to_bytes() if payload is not None else b"")
+        request = codec.decode_control(payload.to_bytes() if payload is not None else b"")
+        timeout_s = request.timeout_s
         deadline_s = None if timeout_s is None else time.monotonic() + timeout_s
+        work = self._work(verb, request.name)
 
         def run() -> None:
             try:
@@ -372,15 +381,14 @@ class ControlQueryable:
                     raise DeadlineError(
                         f"{verb}: {timeout_s} s passed before the clouds ahead of it were mapped"
                     )
-                if verb == "clear":
-                    self._clear()
+                done = work()
             except PotserverError as error:
                 self._refuse(query, verb, error)
             except Exception:
                 log.exception("control_failed", key=self._keys.control(verb))
                 self._refuse(query, verb, PotserverError(_BUG))
             else:
-                self._done(query, verb)
+                self._done(query, verb, done)
 
         is_drain = verb == "drain"
         self._intake.admit_barrier(
@@ -390,12 +398,22 @@ class ControlQueryable:
             self._withdraw()
             log.info("map_draining", map_id=self._keys.map_id)
 
-    def _done(self, query: zenoh.Query, verb: str) -> None:
+    def _work(self, verb: str, name: str | None) -> Callable[[], str]:
+        """What the writer thread shall do; it returns what was done, for people."""
+        if name is not None and verb not in ("save", "load"):
+            raise BadMessageError(f"{verb} takes no name")
+        if verb == "load":
+            if name is None:
+                raise BadMessageError("load needs the name of a saved map")
+            return lambda: self._writer.load(name)
+        if verb == "save":
+            return lambda: self._writer.save(name)
+        if verb == "clear":
+            return self._writer.clear
+        return lambda: "all clouds are in the map; only a restart of the server takes clouds again"
+
+    def _done(self, query: zenoh.Query, verb: str, done: str) -> None:
         snapshot = self._mapper.snapshot
-        done = {
-            "clear": "the map is empty",
-            "drain": "all clouds are in the map; only a restart of the server takes clouds again",
-        }[verb]
         self._health.count(f"control.{verb}.ok")
 
         def send() -> None:

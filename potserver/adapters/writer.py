@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import collections
 import time
+from collections.abc import Mapping
 
 from potserver.adapters import codec
 from potserver.adapters.intake import CloudJob, IntakeQueue
 from potserver.adapters.limits import Limits
 from potserver.adapters.log import get_logger
-from potserver.adapters.ports import Mapper
+from potserver.adapters.ports import Keeper, Mapper
 from potserver.adapters.poses import PoseBuffer
 from potserver.adapters.receipts import ReceiptSender
 from potserver.adapters.stamps import check_not_future
-from potserver.domain.types import Float64, Scan
+from potserver.domain.types import Float64, Scan, TileChange
 from potserver.errors import OldStampError, PotserverError
 from potserver.services.health import Health
 
@@ -28,6 +29,8 @@ class MapWriter:
         map_id: str,
         *,
         mapper: Mapper,
+        keeper: Keeper,
+        last_stamps: Mapping[str, int],
         intake: IntakeQueue,
         receipts: ReceiptSender,
         poses: PoseBuffer,
@@ -39,11 +42,12 @@ class MapWriter:
         pose_wait_s: float,
     ) -> None:
         self._map_id = map_id
-        self._mapper, self._intake, self._receipts = mapper, intake, receipts
+        self._mapper, self._keeper = mapper, keeper
+        self._intake, self._receipts = intake, receipts
         self._poses, self._health, self._limits = poses, health, limits
         self._allowed_robots, self._allow_old_stamps = allowed_robots, allow_old_stamps
         self._max_future_s, self._pose_wait_s = max_future_s, pose_wait_s
-        self._last_stamps: collections.OrderedDict[str, int] = collections.OrderedDict()
+        self._last_stamps: collections.OrderedDict[str, int] = collections.OrderedDict(last_stamps)
 
     def run(self) -> None:
         """Work until the intake queue closes."""
@@ -58,14 +62,51 @@ class MapWriter:
             finally:
                 self._intake.done()
 
-    def clear(self) -> None:
-        """Empty the map and tell the planners; runs on the writer thread, as a barrier."""
-        changed = self._mapper.clear()
+    def clear(self) -> str:
+        """Empty the map and tell the planners; like the verbs below it runs on the writer thread, as a barrier.
+
+        Returns:
+            What was done, for people; so do the verbs below.
+        Raises:
+            StorageError: the store does not take it. The map is unchanged, as after any error here.
+        """
+        changed = self._mapper.clear(commit=lambda state: self._keeper.replace(state, {}))
         self._last_stamps.clear()  # the same log may be replayed into the empty map
         self._health.count("maps.cleared")
+        self._tell(changed)
+        log.info("map_cleared", map_id=self._map_id)
+        return "the map is empty"
+
+    def save(self, name: str | None) -> str:
+        """Write a snapshot, and a file of its own if there is a name.
+
+        Raises:
+            UnsupportedError: the map is kept in memory only.
+            StorageError: the store does not take it.
+        """
+        done = self._keeper.save(name, self._mapper, self._last_stamps)
+        log.info("map_saved", map_id=self._map_id, name=name)
+        return done
+
+    def load(self, name: str) -> str:
+        """Put a saved map in the place of this one, and tell the planners.
+
+        Raises:
+            UnsupportedError: the map is kept in memory only.
+            UnknownMapError, MapFileError: there is no such map, or it cannot be used.
+            StorageError: the store does not take it.
+        """
+        state, stamps = self._keeper.load(name, self._mapper)
+        changed = self._mapper.restore(state, commit=lambda new: self._keeper.replace(new, stamps))
+        self._last_stamps = collections.OrderedDict(stamps)
+        self._health.count("maps.loaded")
+        self._tell(changed)
+        log.info("map_loaded", map_id=self._map_id, name=name, n_scans=self._mapper.n_scans)
+        return f"the map is {name!r} of {self._mapper.n_scans} scans"
+
+    def _tell(self, changed: TileChange) -> None:
         snapshot = self._mapper.snapshot
         self._receipts.tick(snapshot.map_revision, len(snapshot), changed)
-        log.info("map_cleared", map_id=self._map_id)
 
     def _integrate(self, job: CloudJob) -> None:
         wait_ms = job.wait_ms()
@@ -76,7 +117,7 @@ class MapWriter:
             codec.check_robot_id(scan.robot_id, self._allowed_robots)
             self._check_stamp(scan)
             started_s = time.perf_counter()
-            update = self._mapper.integrate(scan)
+            update = self._mapper.integrate(scan, commit=lambda: self._keeper.append(scan))
         except PotserverError as error:
             self._receipts.refuse(job, error)
             return
@@ -86,6 +127,7 @@ class MapWriter:
             return
         integrate_ms = (time.perf_counter() - started_s) * 1e3
         self._remember_stamp(scan)
+        self._keeper.advance(self._mapper, self._last_stamps)
         self._health.observe("integrate", integrate_ms)
         self._health.observe("clouds.wait", wait_ms)
         self._receipts.accept(job, scan, update, wait_ms=wait_ms, integrate_ms=integrate_ms)

@@ -44,6 +44,8 @@ _CUBE = 2.5  # of those voxels, in which their rows are solved together
 _MOST_CHECKED = 100  # beams a scan, about
 _CHECK_GAP_M = 0.5  # before a beam's end, where the map is not asked whether it is free
 
+Commit = Callable[[MapState], None]  # told of a new state before it becomes the map
+
 
 class MappingService:
     """One map. What changes it has one caller at a time; `state` may be read from any thread, and never waits.
@@ -200,13 +202,20 @@ class MappingService:
         )  # fmt: skip
         return update
 
-    def clear(self) -> TileChange:
-        """Forget all scans; the revision and the use of atoms go on counting, so that readers notice."""
-        return self._swap(MapState(snapshot=self._map_of(None, revision=self.state.map_revision + 1)))
+    def clear(self, *, commit: Commit | None = None) -> TileChange:
+        """Forget all scans; the revision and the use of atoms go on counting, so that readers notice.
 
-    def restore(self, state: MapState) -> TileChange:
+        Args:
+            commit: Called with the new state before it becomes the map; if it raises, nothing changes.
+        """
+        return self._swap(MapState(snapshot=self._map_of(None, revision=self.state.map_revision + 1)), commit)
+
+    def restore(self, state: MapState, *, commit: Commit | None = None) -> TileChange:
         """Take a state that was saved in place of the present one, with all its numbers.
 
+        Args:
+            state: Its snapshot is made anew, by this service's settings.
+            commit: As for `clear`.
         Raises:
             SettingsError: it was made with another `tile_size_m`.
         """
@@ -216,11 +225,15 @@ class MappingService:
                 f"the saved map has tiles of {state.tiled.grid.size_m} m, mapping.tile_size_m is {size}: set it to the map's"
             )
         snapshot = self._map_of(state.tiled, revision=state.map_revision, scores=state.scores)
-        return self._swap(dataclasses.replace(state, snapshot=snapshot))
+        return self._swap(dataclasses.replace(state, snapshot=snapshot), commit)
 
-    def merge(self, other: MapState, T_map_other: Float64) -> TileChange:
+    def merge(self, other: MapState, T_map_other: Float64, *, commit: Commit | None = None) -> TileChange:
         """Take in another map of the same place, see `map_edits.merge`.
 
+        Args:
+            other: It is not changed.
+            T_map_other: (4, 4) rigid.
+            commit: As for `clear`.
         Raises:
             BadPoseError: the transform is not rigid. The map is unchanged, as after any error.
         """
@@ -234,11 +247,14 @@ class MappingService:
         tiled, changed = map_edits.merge(
             ours, other.tiled, T_map_other, self.settings, moment, threads=self._threads
         )
-        return self._edited(tiled, changed, moment, n_scans=state.n_scans + other.n_scans)
+        return self._edited(tiled, changed, moment, state.n_scans + other.n_scans, commit)
 
-    def remove_robot(self, robot_id: str) -> TileChange:
+    def remove_robot(self, robot_id: str, *, commit: Commit | None = None) -> TileChange:
         """Take out what one robot has seen, see `map_edits.remove_robot`.
 
+        Args:
+            robot_id: Whose.
+            commit: As for `clear`.
         Raises:
             UnknownRobotError: the map has nothing from this robot. The map is unchanged, as after any error.
             UnsupportedError: the map keeps no evidence.
@@ -250,7 +266,7 @@ class MappingService:
         tiled, changed = map_edits.remove_robot(
             state.tiled, robot_id, self.settings, moment, threads=self._threads
         )
-        return self._edited(tiled, changed, moment, n_scans=state.n_scans)
+        return self._edited(tiled, changed, moment, state.n_scans, commit)
 
     def warm_up(self) -> None:
         """Compile or load the numerics on small synthetic scans, in a map of its own."""
@@ -364,17 +380,29 @@ class MappingService:
         )  # fmt: skip
 
     def _edited(
-        self, tiled: TiledMap, changed: Iterable[TileIndex], moment: Moment, *, n_scans: int
+        self,
+        tiled: TiledMap,
+        changed: Iterable[TileIndex],
+        moment: Moment,
+        n_scans: int,
+        commit: Commit | None,
     ) -> TileChange:
-        state = self.state
-        snapshot = self._map_of(tiled, revision=moment.revision, scores=state.scores)
-        self.state = dataclasses.replace(
-            state, snapshot=snapshot, tiled=tiled, n_scans=n_scans, stamp_ns=moment.stamp_ns
+        state = dataclasses.replace(
+            self.state,
+            snapshot=self._map_of(tiled, revision=moment.revision, scores=self.state.scores),
+            tiled=tiled,
+            n_scans=n_scans,
+            stamp_ns=moment.stamp_ns,
         )
+        if commit is not None:
+            commit(state)
+        self.state = state
         return TileChange(tiled.grid.size_m, sorted(changed))
 
-    def _swap(self, state: MapState) -> TileChange:
+    def _swap(self, state: MapState, commit: Commit | None) -> TileChange:
         """Put another map in the place of this one; all tiles of both have changed."""
+        if commit is not None:
+            commit(state)
         tiles = {index for s in (self.state, state) if s.tiled is not None for index in s.tiled.tiles}
         self.state = state
         return TileChange(self.settings.tile_size_m, sorted(tiles))

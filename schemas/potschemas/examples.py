@@ -346,6 +346,8 @@ def examples() -> dict[str, m.Message]:
     )
     add(_info(limits, lower=[-40.0, -32.5, -2.0], upper=[88.0, 64.0, 6.5], n_scans=31))
     add(_info(limits, lower=None, upper=None, n_scans=0), "empty_map")
+    kept = _info(limits, lower=None, upper=None, n_scans=0)
+    add(msgspec.structs.replace(kept, durable=True), "durable")
     ray_limits = msgspec.structs.replace(
         limits,
         max_query_rays=50_000,
@@ -393,6 +395,7 @@ def examples() -> dict[str, m.Message]:
 
     add(m.ControlRequest(timeout_s=5.0))
     add(m.ControlRequest(), "minimal")
+    add(m.ControlRequest(name="before-the-rain"), "name")
     add(m.ControlReply(verb="clear", map_revision=32, message="5120 kernels removed"))
     add(m.ErrorReply(code=m.ErrorCode.BAD_POSE, message="the pose has NaN or infinite entries"))
     add(

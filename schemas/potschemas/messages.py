@@ -520,6 +520,7 @@ class Info(Message, frozen=True, kw_only=True):
     mean_moderation: Finite = 1.0  # share of the latent variance that pulls the mean towards 0.5
     limits: Limits  # what the server accepts
     started_ns: Sequence  # when the server started
+    durable: bool | Absent = ABSENT  # true: accepted clouds survive a crash of the server, false: they do not
 
 
 class StatsQuery(Message, frozen=True, kw_only=True):
@@ -574,6 +575,7 @@ class ControlRequest(Message, frozen=True, kw_only=True):
     schema: ClassVar[str] = "pot.control.v1"
 
     timeout_s: Positive | None = None  # s, how long the work may take; absent = the server's default
+    name: Identifier | Absent = ABSENT  # of a saved map; `load` needs it, `save` writes a file of its own
 
 
 class ControlReply(Message, frozen=True, kw_only=True):
@@ -608,6 +610,9 @@ class ErrorCode(str, Enum):
     OVERLOADED = "overloaded"  # the queue is full; retry after retry_after_s
     DEADLINE = "deadline"  # the deadline passed before the work could start
     SHUTTING_DOWN = "shutting_down"  # the server takes no more work
+    STORAGE = "storage"  # the server's disk did not take it; nothing was changed
+    UNKNOWN_MAP = "unknown_map"  # no map was saved under that name
+    MAP_FILE = "map_file"  # a saved map that cannot be used; the field `reason` says why
     INTERNAL = "internal"  # a bug of the server; the traceback is in its log
 
 

@@ -265,7 +265,7 @@ class FakeMapper:
     def use_dictionary(self, dictionary: AtomDictionary) -> None:
         self.dictionary = dictionary
 
-    def clear(self) -> TileChange:
+    def clear(self, *, commit: Any = None) -> TileChange:
         tiles = np.unique(np.floor(self.snapshot.kernels.hinge_mean / 10.0).astype(int), axis=0)
         self.snapshot = FakeSnapshot(self, KernelSet.empty(), self.snapshot.map_revision + 1)
         self.n_scans = 0

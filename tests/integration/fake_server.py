@@ -15,7 +15,7 @@ import zenoh
 
 from potclient.kernels import KernelSet
 from potschemas import messages
-from potschemas.keys import QUERY_OPS, MapKeys, stats_key
+from potschemas.keys import CONTROL_VERBS, QUERY_OPS, MapKeys, stats_key
 from potschemas.messages import ErrorCode, ReceiptStatus
 from potschemas.wire import MIME, decode, decode_array, encode, encode_array, encoding_of
 
@@ -89,6 +89,7 @@ class FakeServer:
         self.atoms: list[messages.Atom] = []  # that were added
         self.poses: queue.Queue[messages.Pose] = queue.Queue()
         self.points = np.zeros((0, 3))
+        self.saved: dict[str, Any] = {}
         self.revision = 0
         self.queries: list[str] = []
         self._held: list[zenoh.Query] = []
@@ -110,7 +111,7 @@ class FakeServer:
         )
         for op in QUERY_OPS:
             self._queryable(k.query(op), op)
-        for verb in ("clear", "drain"):
+        for verb in CONTROL_VERBS:
             self._queryable(k.control(verb), f"ctl-{verb}")
         self._queryable(stats_key(k.root, SERVER), "stats")
         self._token: Any = None
@@ -264,7 +265,10 @@ class FakeServer:
                 return
             payload = query.payload.to_bytes() if query.payload is not None else b""
             for message in self._replies(op, payload):
-                query.reply(key, encode(message), encoding=encoding_of(message))
+                if isinstance(message, messages.ErrorReply):
+                    query.reply_err(encode(message), encoding=encoding_of(message))
+                else:
+                    query.reply(key, encode(message), encoding=encoding_of(message))
             assert str(query.encoding).startswith(MIME)
 
     def _map(self) -> KernelSet:
@@ -468,6 +472,23 @@ class FakeServer:
             self.points = np.zeros((0, 3))
             self.revision += 1
         return [messages.ControlReply(verb="clear", map_revision=self.revision, message="cleared")]
+
+    def _reply_ctl_save(self, payload: bytes) -> list[messages.Message]:
+        name = decode(payload, messages.ControlRequest).name
+        if name is messages.ABSENT:
+            return [messages.ControlReply(verb="save", map_revision=self.revision, message="saved")]
+        with self._lock:
+            self.saved[name] = self.points
+        return [messages.ControlReply(verb="save", map_revision=self.revision, message=f"saved as {name}")]
+
+    def _reply_ctl_load(self, payload: bytes) -> list[messages.Message]:
+        name = decode(payload, messages.ControlRequest).name
+        if name is messages.ABSENT or name not in self.saved:
+            return [messages.ErrorReply(code=ErrorCode.UNKNOWN_MAP, message=f"no map {name}")]
+        with self._lock:
+            self.points = self.saved[name]
+            self.revision += 1
+        return [messages.ControlReply(verb="load", map_revision=self.revision, message=f"loaded {name}")]
 
     def _reply_ctl_drain(self, payload: bytes) -> list[messages.Message]:
         return [messages.ControlReply(verb="drain", map_revision=self.revision, message="drained")]

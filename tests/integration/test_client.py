@@ -31,6 +31,7 @@ from potclient.errors import (
     PotclientError,
     QueryTimeoutError,
     ReadOnlyError,
+    UnknownMapError,
     UsageError,
     error_from_reply,
 )
@@ -365,6 +366,19 @@ def test_atoms_info_stats_and_control(client: MapClient) -> None:
     assert client.stats().server == client.stats("fake").server == "fake"
     assert client.control("clear").map_revision == 2
     assert client.info().n_kernels == 0
+
+
+def test_a_map_is_saved_and_loaded_by_name(client: MapClient) -> None:
+    client.integrate(cloud(), pose())
+    assert client.save().message == "saved"
+    assert client.save("before-the-rain").message == "saved as before-the-rain"
+    client.control("clear")
+    reply = client.load("before-the-rain")
+    assert (reply.verb, reply.map_revision, client.info().n_kernels) == ("load", 3, 60)
+    with pytest.raises(UnknownMapError, match="no map other"):
+        client.load("other")
+    with pytest.raises(UsageError, match="is not an id"):
+        client.save("../elsewhere")
 
 
 def test_an_atom_travels_both_ways_unchanged(client: MapClient, server: FakeServer, tmp_path: Path) -> None:

@@ -82,6 +82,7 @@ def serve(tmp_path: Path) -> Iterator[Any]:
             file.write_text("[mapping]\nmax_range_m = 15.0\nbeams_per_scan = 500\n")
             process = Process(
                 "serve",
+                "--in-memory",
                 "--settings",
                 str(file),
                 "--log-format",
@@ -148,7 +149,7 @@ def test_a_program_that_forgets_to_stop_still_ends() -> None:
 
 def test_a_taken_port_is_one_line_and_exit_code_two(serve: Any) -> None:
     process, endpoint = serve()
-    other = Process("serve", "--listen", endpoint, "--log-level", "error")
+    other = Process("serve", "--in-memory", "--listen", endpoint, "--log-level", "error")
     assert other.wait() == 2
     other.close()
     (line,) = other.lines

@@ -25,6 +25,7 @@ from potclient.session import (
     open_session,
     options_from_arguments,
 )
+from potschemas.keys import CONTROL_VERBS
 from potschemas.messages import ErrorCode, ReceiptStatus
 from tests.integration.fake_server import FakeServer, free_port
 
@@ -40,7 +41,7 @@ COMMANDS = (
     "load",
     "info",
     "atoms",
-    "control",
+    "map",
 )
 
 
@@ -259,7 +260,7 @@ def test_grid_writes_a_file_and_a_picture(run: Run, tmp_path: Path) -> None:
     assert "the map is empty" in err
 
 
-def test_info_atoms_and_control(run: Run, tmp_path: Path) -> None:
+def test_info_and_atoms(run: Run, tmp_path: Path) -> None:
     status, out, _ = run("info", "--stats")
     assert status == 0
     assert re.search(r"^server +fake$", out, re.MULTILINE)
@@ -280,9 +281,20 @@ def test_info_atoms_and_control(run: Run, tmp_path: Path) -> None:
     assert [change["atom_id"] for change in json.loads(out)] == ["wall.1", "wall.2"]
     status, out, _ = run("atoms", "remove", "wall.1")
     assert out == "wall.1 removed, 0 atoms, until the server restarts\n"
-    status, out, _ = run("control", "clear")
-    assert status == 0
-    assert out.startswith("clear: cleared")
+
+
+def test_map_verbs(run: Run) -> None:
+    assert run("map", "save", "here")[:2] == (0, "save: saved as here (revision 0)\n")
+    assert run("map", "load", "here")[:2] == (0, "load: loaded here (revision 1)\n")
+    assert run("map", "clear")[:2] == (0, "clear: cleared (revision 2)\n")
+    assert run("map", "drain")[:2] == (0, "drain: drained (revision 2)\n")
+    status, _, err = run("map", "load", "elsewhere")
+    assert status == 1
+    assert "no map elsewhere" in err
+    status, _, err = run("map", "load")
+    assert (status, "name a saved map" in err) == (2, True)
+    status, _, err = run("map", "clear", "here")
+    assert (status, "clear takes no name" in err) == (2, True)
 
 
 def test_watch_ends_by_itself(run: Run) -> None:
@@ -365,12 +377,11 @@ def test_an_interrupted_load_reports_and_says_so(run: Run, monkeypatch: pytest.M
     assert "interrupted" in err
 
 
-def test_control_help_names_the_verbs_there_are(capsys: pytest.CaptureFixture[str]) -> None:
+def test_help_names_the_verbs_of_a_map(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
         main(["--help"])
     text = " ".join(capsys.readouterr().out.split())
-    assert "verb: clear, drain" in text
-    assert "save, load" not in text
+    assert f"the map as a whole: {', '.join(CONTROL_VERBS)}" in text
 
 
 def test_load_prints_a_table_and_accounts_for_everything(run: Run, tmp_path: Path) -> None:

@@ -98,9 +98,9 @@ def test_errors_travel_by_code(code: ErrorCode) -> None:
     )
 
 
-def test_only_load_and_shutdown_are_worth_another_try() -> None:
+def test_only_load_shutdown_and_a_full_disk_are_worth_another_try() -> None:
     retryable = {code for code, kind in error_classes().items() if kind.retryable}
-    assert retryable == {"overloaded", "deadline", "shutting_down"}
+    assert retryable == {"overloaded", "deadline", "shutting_down", "storage"}
     assert codec.refusal(errors.OverloadedError("")) is ReceiptStatus.DROPPED
     assert codec.refusal(errors.BadPoseError("")) is ReceiptStatus.REJECTED
 
@@ -262,7 +262,7 @@ def test_an_empty_payload_is_a_message_of_defaults() -> None:
     codec.decode_stats_query(b"")
     assert codec.decode_atoms_query(b"", LIMITS) == (messages.AtomsAction.READ, None, None)
     assert codec.decode_params_query(b"") == (None, None, None)
-    assert codec.decode_control(b"") is None
+    assert codec.decode_control(b"") == (None, None)
     with pytest.raises(errors.BadMessageError):
         codec.decode_grid_query(b"")
 

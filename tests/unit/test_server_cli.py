@@ -249,3 +249,27 @@ def test_serve_help_says_who_may_write(capsys: pytest.CaptureFixture[str]) -> No
     text = " ".join(capsys.readouterr().out.split())
     assert "Anyone who reaches the port may write: use Zenoh's access control and TLS." in text
     assert "security notes" not in text
+
+
+def _store(capsys: pytest.CaptureFixture[str], *flags: str) -> str | None:
+    assert cli.main(["config", "show", "--json", *flags]) == 0
+    directory: str | None = json.loads(capsys.readouterr().out)["store"]["directory"]
+    return directory
+
+
+def test_a_server_keeps_its_maps_in_the_users_state_folder_unless_told_otherwise(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    assert _store(capsys) == str(tmp_path / "potserver" / "potserver")
+    assert _store(capsys, "--server-id", "roof") == str(tmp_path / "potserver" / "roof")
+    assert _store(capsys, "--store", "maps") == "maps"
+    assert _store(capsys, "--in-memory") == ""
+    monkeypatch.setenv("POTSERVER_STORE__DIRECTORY", "/var/maps")
+    assert _store(capsys) == "/var/maps"
+    assert _store(capsys, "--in-memory") == ""
+    monkeypatch.delenv("POTSERVER_STORE__DIRECTORY")
+    for relative in ("", "state"):
+        monkeypatch.setenv("XDG_STATE_HOME", relative)
+        monkeypatch.setenv("HOME", str(tmp_path))
+        assert _store(capsys) == str(tmp_path / ".local" / "state" / "potserver" / "potserver")

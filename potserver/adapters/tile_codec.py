@@ -1,0 +1,149 @@
+"""A tile as bytes on the disk: bit for bit what it was, and compact.
+
+head     what the tile is: its index, revision, stamp, and how many rows and kernels follow
+body     the arrays, column by column, each number's bytes apart (all first bytes, then all second ones), deflated: what is
+         alike in a column, such as the widths of a lattice's kernels or their places on it, then takes next to nothing
+digest   BLAKE2b of head and body
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import struct
+import zlib
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from potserver.domain.tiles import CARRIED, MapKernels, Tile, TileGrid, TileIndex
+from potserver.domain.types import KernelSet
+from potserver.errors import MapFileError, ShapeError
+from potserver.numerics.evidence import Rows
+
+DIGEST_BYTES = 16
+_HEAD = struct.Struct("<3i2q2I")  # index, revision, stamp_ns, rows, kernels
+_LEVEL = 1  # of deflate: the higher ones cost ten times as much for a few per cent
+
+
+class _Column(NamedTuple):
+    name: str
+    dtype: str  # little-endian
+    width: int  # numbers a row; 0: one, and no second axis
+
+
+# Voxels are numbered within their tile, which has at most 2**14 along an edge.
+_ROWS = (
+    _Column("voxel", "<i2", 3),
+    _Column("occupied", "|b1", 0),
+    _Column("sums", "<f4", 4),
+    _Column("source", "<i2", 0),
+)
+_KERNELS = (
+    _Column("hinge_mean", "<f8", 3),
+    _Column("hinge_var", "<f4", 3),
+    _Column("gamma_shape", "<f4", 0),
+    _Column("gamma_rate", "<f4", 0),
+    _Column("weight_mean", "<f4", 0),
+    _Column("weight_var", "<f4", 0),
+)
+_MAP_KERNELS = (_Column("level", "|i1", 0), _Column("prior_mean", "<f4", 0), _Column("prior_var", "<f4", 0))
+
+
+def digest_of(*parts: bytes) -> bytes:
+    """What tells a damaged record; not a signature."""
+    state = hashlib.blake2b(digest_size=DIGEST_BYTES)
+    for part in parts:
+        state.update(part)
+    return state.digest()
+
+
+def encode_tile(index: TileIndex, tile: Tile) -> bytes:
+    """A tile whose arrays are as `Region.tiles` cuts them."""
+    rows, kernels = tile.rows, tile.kernels
+    columns = [
+        *(_planes(getattr(rows, c.name), c) for c in _ROWS),
+        *(_planes(getattr(kernels.kernels, c.name), c) for c in _KERNELS),
+        *(_planes(getattr(kernels, c.name), c) for c in _MAP_KERNELS),
+    ]
+    head = _HEAD.pack(*index, tile.revision, tile.stamp_ns, len(rows.occupied), len(kernels))
+    body = zlib.compress(b"".join(columns), _LEVEL)
+    return head + body + digest_of(head, body)
+
+
+def decode_tile(data: bytes, grid: TileGrid, n_robots: int) -> tuple[TileIndex, Tile]:
+    """The tile in `data`, and where it belongs.
+
+    Args:
+        data: As `encode_tile` made it.
+        grid: Of the map.
+        n_robots: Of the map; rows name their robot by its number.
+    Raises:
+        MapFileError: the bytes are damaged, or no tile of such a map.
+    """
+    head, body, digest = data[: _HEAD.size], data[_HEAD.size : -DIGEST_BYTES], data[-DIGEST_BYTES:]
+    if len(data) < _HEAD.size + DIGEST_BYTES or digest_of(head, body) != digest:
+        raise MapFileError("a tile's checksum does not fit its content", reason="damaged")
+    x, y, z, revision, stamp_ns, n_rows, n_kernels = _HEAD.unpack(head)
+    sizes = [(c, n_rows) for c in _ROWS] + [(c, n_kernels) for c in (*_KERNELS, *_MAP_KERNELS)]
+    n_bytes = sum(n * max(1, c.width) * np.dtype(c.dtype).itemsize for c, n in sizes)
+    try:
+        inflate = zlib.decompressobj()
+        plain = inflate.decompress(body, n_bytes + 1)  # one more would show that there is more
+        if len(plain) != n_bytes or not inflate.eof:
+            raise MapFileError(f"tile {(x, y, z)} is not of the size that it says", reason="damaged")
+        arrays, start = {}, 0
+        for column, n in sizes:
+            arrays[column.name], start = _numbers(plain, start, column, n)
+        tile = Tile(
+            Rows(
+                arrays["voxel"].astype(np.int32),
+                arrays["occupied"],
+                arrays["sums"],
+                arrays["source"],
+            ),
+            MapKernels(
+                kernels=KernelSet(**{f.name: arrays[f.name] for f in dataclasses.fields(KernelSet)}),
+                **{c.name: arrays[c.name] for c in _MAP_KERNELS},
+            ),
+            revision,
+            stamp_ns,
+        )
+    except (zlib.error, ShapeError) as error:
+        raise MapFileError(f"tile {(x, y, z)}: {error}", reason="damaged") from error
+    _check(tile, grid, n_robots, (x, y, z))
+    return (x, y, z), tile
+
+
+def _check(tile: Tile, grid: TileGrid, n_robots: int, index: TileIndex) -> None:
+    """A sound checksum does not say who wrote the file."""
+    rows, kernels = tile.rows, tile.kernels
+    edge = np.where(rows.occupied, 2 * grid.voxels, grid.voxels)[:, None]
+    sound = (
+        ((rows.voxel >= 0) & (rows.voxel < edge)).all()
+        and np.isfinite(rows.sums).all()
+        and ((rows.source >= 0) & (rows.source < n_robots)).all()
+        and ((kernels.level >= 0) & (kernels.level <= CARRIED)).all()
+        and np.isfinite(kernels.prior_mean).all()
+        and (np.isfinite(kernels.prior_var) & (kernels.prior_var > 0)).all()
+    )
+    if not sound:
+        raise MapFileError(f"tile {index} has rows or kernels that no map makes", reason="damaged")
+
+
+def _planes(array: NDArray[Any], column: _Column) -> bytes:
+    """An array's bytes, number by number within a row and byte by byte within a number, each over all rows."""
+    little = np.ascontiguousarray(array, column.dtype)
+    if not len(little):
+        return b""
+    return bytes(little.reshape(len(little), -1).view(np.uint8).T.tobytes())
+
+
+def _numbers(plain: bytes, start: int, column: _Column, n: int) -> tuple[NDArray[Any], int]:
+    dtype = np.dtype(column.dtype)
+    width = max(1, column.width)
+    n_bytes = n * width * dtype.itemsize
+    planes = np.frombuffer(plain, np.uint8, n_bytes, start).reshape(width * dtype.itemsize, n)
+    array = np.ascontiguousarray(planes.T).view(dtype)
+    return array.reshape((n, column.width) if column.width else n), start + n_bytes
