@@ -125,6 +125,14 @@ examples:
   potserver map import hall.bt -o ~/.local/state/potserver/potserver/saved/hall.map
   potclient map load hall"""
 
+_MAP_MERGE = """Write one map that knows what two saved ones know, as if one server had been fed by both. Scans that both of
+them hold would count twice. A running server takes in a saved map with `potclient map merge`.
+"""
+_MAP_MERGE_EXAMPLES = """examples:
+  potserver map merge south.map north.map -o campus.map
+  potserver map merge south.map north.map --pose 120 -35 0 40 -o campus.map   north's origin lies there, turned by 40 degrees
+"""
+
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point of the `potserver` command; returns the exit code."""
@@ -488,6 +496,22 @@ def _add_map_commands(commands: Any) -> None:
     )
     _add_settings_flags(import_)
     import_.set_defaults(map_command="import", settings_flags=True)
+
+    merge = commands.add_parser(
+        "merge",
+        help="one saved map of two",
+        description=_MAP_MERGE,
+        epilog=_MAP_MERGE_EXAMPLES,
+        formatter_class=_Formatter,
+    )
+    merge.add_argument("path", type=Path, metavar="FILE", help="a *.map file, or a map's folder in a store")
+    merge.add_argument("other", type=Path, metavar="OTHER", help="the one that is taken in")
+    merge.add_argument(
+        "-o", "--out", type=Path, required=True, metavar="FILE", help="the *.map file to write"
+    )
+    client_cli.add_pose_flag(merge)
+    _add_settings_flags(merge)
+    merge.set_defaults(map_command="merge", settings_flags=True)
 
 
 def _add_build_flags(parser: argparse.ArgumentParser) -> None:

@@ -1,4 +1,4 @@
-"""`potserver map info | export | import`: kept maps without a server."""
+"""`potserver map info | export | import | merge`: kept maps without a server."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def run(options: argparse.Namespace, settings: Settings, say: Say) -> int:
     Raises:
         MapFileError, SettingsError, StorageError: the file, the flags, or the disk.
     """
-    commands = {"info": _info, "export": _export, "import": _import}
+    commands = {"info": _info, "export": _export, "import": _import, "merge": _merge}
     try:
         return commands[options.map_command](options, settings, say)
     except UsageError as error:
@@ -201,12 +201,7 @@ class UnservedMap:
 
 def _export(options: argparse.Namespace, _settings: Settings, _say: Say) -> int:
     client_cli.check_export_flags(options)
-    (path, *others) = _map_files(options.path)
-    if others:
-        raise SettingsError(
-            f"{options.path} holds several maps; name one: {', '.join(map(str, [path, *others]))}"
-        )
-    return client_cli.export_map(UnservedMap(read_map(path)), options)
+    return client_cli.export_map(UnservedMap(read_map(_one_file(options.path))), options)
 
 
 # --- import -----------------------------------------------------------------------------------------------------------
@@ -230,11 +225,7 @@ def _import(options: argparse.Namespace, settings: Settings, say: Say) -> int:
         state, keeps_evidence = _from_kernels(path, settings), False
         stamps, map_id = {}, settings.maps[0]
     else:
-        (file, *others) = _map_files(path)
-        if others:
-            raise SettingsError(
-                f"{path} holds several maps; name one: {', '.join(map(str, [file, *others]))}"
-            )
+        file = _one_file(path)
         saved = read_map(file)
         state, keeps_evidence = _with_rule(saved), saved.record.keeps_evidence
         stamps, map_id = saved.record.stamps, saved.record.map_id
@@ -330,3 +321,37 @@ def _read(read: Callable[[], Any], path: Path) -> Any:
         return read()
     except OSError as error:
         raise MapFileError(f"cannot read {path}: {error.strerror or error}", reason="missing") from error
+
+
+# --- merge ------------------------------------------------------------------------------------------------------------
+
+
+def _merge(options: argparse.Namespace, settings: Settings, say: Say) -> int:
+    ours, theirs = (read_map(_one_file(path)) for path in (options.path, options.other))
+    if ours.record.keeps_evidence != theirs.record.keeps_evidence:
+        raise MapFileError(
+            "one map keeps evidence and the other kernels alone: they cannot be merged", reason="settings"
+        )
+    size_m = ours.record.grid[0] if ours.record.grid else settings.mapping.tile_size_m
+    mapping = dataclasses.replace(settings.mapping, tile_size_m=size_m)
+    service = MappingService(AtomDictionary(()), mapping, threads=settings.threads)
+    service.restore(ours.state())
+    say(f"merging {theirs.record.n_scans} scans into {ours.record.n_scans}: some seconds for a street")
+    change = service.merge(theirs.state(), client_cli.pose_of(*options.pose) if options.pose else np.eye(4))
+    stamps = dict(ours.record.stamps)
+    for robot_id, stamp_ns in theirs.record.stamps.items():
+        stamps[robot_id] = max(stamp_ns, stamps.get(robot_id, 0))
+    n_bytes = write_map(
+        options.out, service.state, Origin(ours.record.map_id, ours.record.keeps_evidence, stamps)
+    )
+    say(
+        f"wrote {options.out}: {len(service.snapshot)} kernels, {len(change.tiles)} tiles changed, {n_bytes} bytes"
+    )
+    return 0
+
+
+def _one_file(path: Path) -> Path:
+    (file, *others) = _map_files(path)
+    if others:
+        raise SettingsError(f"{path} holds several maps; name one: {', '.join(map(str, [file, *others]))}")
+    return file

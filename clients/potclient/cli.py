@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 import numpy as np
+from numpy.typing import NDArray
 
 from potclient.atoms import Atom
 from potclient.client import MapClient
@@ -1188,33 +1189,68 @@ def _add_map(commands: Any) -> None:
         commands,
         "map",
         _map,
-        help="the map as a whole: save, load, clear, drain",
-        description="""Have the server save its map, load a saved one, forget everything, or finish its queue and take no
-more clouds. Each comes after all clouds that the server has taken before it.
+        help=f"the map as a whole: {', '.join(CONTROL_VERBS)}",
+        description="""Have the server save its map, load or merge a saved one, forget a robot or everything, or finish its
+queue and take no more clouds. Each comes after all clouds that the server has taken before it.
 
 What a server keeps survives its restarts by itself. `save NAME` makes a copy beside that, in the folder `saved` of the
-server's store, which `load NAME` puts in the place of the present map.""",
+server's store: `load NAME` puts it in the place of the present map, `merge NAME` adds what it knows.""",
         epilog="""examples:
   potclient map save                    write everything to the disk now
   potclient map save before-the-rain    and a copy with a name
   potclient map load before-the-rain    go back to it: what came since is gone
+  potclient map merge north-wing --pose 12.5 -3.0 0 90
+                                        take in what another server saved; its origin in our map: x y z m, yaw degrees
+  potclient map forget rover-1          take out what one robot has seen
   potclient map clear                   forget everything
   potclient map drain                   before the server is replaced""",
     )
     parser.add_argument("verb", choices=CONTROL_VERBS, help="what to do")
-    parser.add_argument("name", nargs="?", metavar="NAME", help="of a saved map, for save and load")
+    parser.add_argument(
+        "name",
+        nargs="?",
+        metavar="NAME",
+        help="of a saved map, for save, load and merge; of a robot, for forget",
+    )
+    add_pose_flag(parser)
+
+
+def add_pose_flag(parser: argparse.ArgumentParser) -> None:
+    """`--pose`, for maps that are merged."""
+    parser.add_argument(
+        "--pose",
+        type=float,
+        nargs=4,
+        metavar=("X", "Y", "Z", "YAW"),
+        help="merge: where the origin of the map that is taken in lies in the other, m, and by how many degrees it is turned",
+    )
 
 
 def _map(arguments: argparse.Namespace) -> int:
     verb, name = arguments.verb, arguments.name
-    if verb == "load" and name is None:
-        raise UsageError("map: load which? name a saved map")
-    if name is not None and verb not in ("save", "load"):
+    if verb in ("load", "merge") and name is None:
+        raise UsageError(f"map: {verb} which? name a saved map")
+    if verb == "forget" and name is None:
+        raise UsageError("map: forget whom? name a robot; `map clear` forgets everything")
+    if name is not None and verb in ("clear", "drain"):
         raise UsageError(f"map: {verb} takes no name")
+    if arguments.pose is not None and verb != "merge":
+        raise UsageError(f"map: {verb} takes no pose")
     with _client(arguments) as client:
-        reply = client.control(verb, name=name)
+        if verb == "forget":
+            reply = client.forget(name)
+        elif verb == "merge":
+            reply = client.merge(name, None if arguments.pose is None else pose_of(*arguments.pose))
+        else:
+            reply = client.control(verb, name=name)
     _say(f"{reply.verb}: {reply.message} (revision {reply.map_revision})")
     return EXIT_OK
+
+
+def pose_of(x_m: float, y_m: float, z_m: float, yaw_deg: float) -> NDArray[np.float64]:
+    """(4, 4) transform of what `--pose` says."""
+    c, s = math.cos(math.radians(yaw_deg)), math.sin(math.radians(yaw_deg))
+    return np.array([[c, -s, 0, x_m], [s, c, 0, y_m], [0, 0, 1, z_m], [0, 0, 0, 1]], np.float64)
 
 
 # --- town ----------------------------------------------------------------------------------------------------------

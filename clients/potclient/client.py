@@ -896,14 +896,47 @@ class MapClient:
         """
         return self.control("load", name=name, timeout_s=timeout_s)
 
-    def control(
-        self, verb: str, *, name: str | None = None, timeout_s: float | None = None
+    def merge(
+        self, name: str, T_map_saved: ArrayLike | None = None, *, timeout_s: float | None = None
     ) -> messages.ControlReply:
-        """Carry out a control verb: save, load, clear, drain.
+        """Have the server take a saved map into the present one, as if one server had been fed by both.
+
+        Args:
+            name: Of the saved map. It must not hold scans that are in the map already: they would count twice.
+            T_map_saved: (4, 4) rigid, p_map = T_map_saved @ p_saved; the same frame by default.
+            timeout_s: For the answer; a large map takes some seconds.
+        Raises:
+            UnknownMapError, MapFileError, UnsupportedError, StorageError: as for `load`.
+            BadPoseError: the transform is not rigid. The map is unchanged, as after any error.
+        """
+        pose = None if T_map_saved is None else np.asarray(T_map_saved, np.float64)
+        return self.control("merge", name=name, T_map_saved=pose, timeout_s=timeout_s)
+
+    def forget(self, robot: str, *, timeout_s: float | None = None) -> messages.ControlReply:
+        """Have the server take out of its map what one robot has seen.
+
+        Raises:
+            UnknownRobotError: the map has nothing from it.
+            UnsupportedError: the map keeps kernels alone (profile `paper`).
+        """
+        return self.control("forget", robot=robot, timeout_s=timeout_s)
+
+    def control(
+        self,
+        verb: str,
+        *,
+        name: str | None = None,
+        robot: str | None = None,
+        T_map_saved: NDArray[np.float64] | None = None,
+        timeout_s: float | None = None,
+    ) -> messages.ControlReply:
+        """Carry out a control verb: save, load, clear, drain, merge, forget.
 
         Args:
             verb: Which.
-            name: Of a saved map, for `save` and `load`.
+            name: Of a saved map, for `save`, `load` and `merge`.
+            robot: Whose scans, for `forget`.
+            T_map_saved: (4, 4), for `merge`.
             timeout_s: For the answer.
         Raises:
             UnsupportedError: the server has no such verb.
@@ -911,7 +944,10 @@ class MapClient:
         timeout_s = self._timeout_s if timeout_s is None else timeout_s
         key = self.keys.control(_legal_id(verb, "verb"))
         request = messages.ControlRequest(
-            timeout_s=timeout_s, name=messages.ABSENT if name is None else _legal_id(name, "name")
+            timeout_s=timeout_s,
+            name=messages.ABSENT if name is None else _legal_id(name, "name"),
+            robot=messages.ABSENT if robot is None else _legal_id(robot, "robot"),
+            T_map_saved=messages.ABSENT if T_map_saved is None else encode_array(T_map_saved),
         )
         sample = next(self._ask_key(key, request, timeout_s))
         return _decode(sample.payload, messages.ControlReply)

@@ -550,16 +550,27 @@ class ControlRequest(NamedTuple):
 
     timeout_s: float | None  # how long the asker waits
     name: str | None  # of a saved map
+    robot_id: str | None
+    T_map_saved: Float64 | None  # (4, 4)
 
 
 def decode_control(payload: bytes) -> ControlRequest:
-    """How long the asker of a control verb waits, and which saved map is meant.
+    """What is asked of a map: how long the asker waits, and what the verb is about.
 
     Raises:
-        BadMessageError: not that message.
+        BadMessageError, ShapeError, BadPoseError: not that message.
     """
     request = _decode(payload, messages.ControlRequest)
-    return ControlRequest(request.timeout_s, None if request.name is messages.ABSENT else request.name)
+    pose = None
+    if request.T_map_saved is not messages.ABSENT:
+        pose = _decode_array(request.T_map_saved, "T_map_saved", (DType.FLOAT64,), (4, 4))
+        check_rigid(pose)
+    return ControlRequest(
+        request.timeout_s,
+        None if request.name is messages.ABSENT else request.name,
+        None if request.robot is messages.ABSENT else request.robot,
+        pose,
+    )
 
 
 def _decode(payload: bytes, kind: type[MessageT], max_bytes: int = _MAX_SMALL_BYTES) -> MessageT:

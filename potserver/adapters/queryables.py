@@ -373,7 +373,7 @@ class ControlQueryable:
         request = codec.decode_control(payload.to_bytes() if payload is not None else b"")
         timeout_s = request.timeout_s
         deadline_s = None if timeout_s is None else time.monotonic() + timeout_s
-        work = self._work(verb, request.name)
+        work = self._work(verb, request)
 
         def run() -> None:
             try:
@@ -398,16 +398,28 @@ class ControlQueryable:
             self._withdraw()
             log.info("map_draining", map_id=self._keys.map_id)
 
-    def _work(self, verb: str, name: str | None) -> Callable[[], str]:
+    def _work(self, verb: str, request: codec.ControlRequest) -> Callable[[], str]:
         """What the writer thread shall do; it returns what was done, for people."""
-        if name is not None and verb not in ("save", "load"):
-            raise BadMessageError(f"{verb} takes no name")
-        if verb == "load":
-            if name is None:
-                raise BadMessageError("load needs the name of a saved map")
-            return lambda: self._writer.load(name)
+        name, robot_id, pose = request.name, request.robot_id, request.T_map_saved
+        for what, given, verbs in (
+            ("name", name, ("save", "load", "merge")),
+            ("robot", robot_id, ("forget",)),
+            ("T_map_saved", pose, ("merge",)),
+        ):
+            if given is not None and verb not in verbs:
+                raise BadMessageError(f"{verb} takes no {what}")
         if verb == "save":
             return lambda: self._writer.save(name)
+        if verb in ("load", "merge"):
+            if name is None:
+                raise BadMessageError(f"{verb} needs the name of a saved map")
+            if verb == "load":
+                return lambda: self._writer.load(name)
+            return lambda: self._writer.merge(name, np.eye(4) if pose is None else pose)
+        if verb == "forget":
+            if robot_id is None:
+                raise BadMessageError("forget needs a robot; to forget everything, clear")
+            return lambda: self._writer.forget(robot_id)
         if verb == "clear":
             return self._writer.clear
         return lambda: "all clouds are in the map; only a restart of the server takes clouds again"

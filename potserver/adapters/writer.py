@@ -14,6 +14,7 @@ from potserver.adapters.ports import Keeper, Mapper
 from potserver.adapters.poses import PoseBuffer
 from potserver.adapters.receipts import ReceiptSender
 from potserver.adapters.stamps import check_not_future
+from potserver.domain.map_state import MapState
 from potserver.domain.types import Float64, Scan, TileChange
 from potserver.errors import OldStampError, PotserverError
 from potserver.services.health import Health
@@ -103,6 +104,38 @@ class MapWriter:
         self._tell(changed)
         log.info("map_loaded", map_id=self._map_id, name=name, n_scans=self._mapper.n_scans)
         return f"the map is {name!r} of {self._mapper.n_scans} scans"
+
+    def merge(self, name: str, T_map_saved: Float64) -> str:
+        """Take a saved map into this one, by a known transform, and tell the planners.
+
+        Raises:
+            UnsupportedError: the map is kept in memory only.
+            UnknownMapError, MapFileError: there is no such map, or it cannot be used.
+            StorageError: the store does not take it.
+        """
+        other, _ = self._keeper.load(name, self._mapper)
+        changed = self._mapper.merge(other, T_map_saved, commit=self._keep)
+        self._health.count("maps.merged")
+        self._tell(changed)
+        log.info("map_merged", map_id=self._map_id, name=name, n_tiles=len(changed.tiles))
+        return f"{name!r} of {other.n_scans} scans is in the map, {len(changed.tiles)} tiles changed"
+
+    def forget(self, robot_id: str) -> str:
+        """Take out what one robot has seen, and tell the planners.
+
+        Raises:
+            UnknownRobotError: the map has nothing from it.
+            UnsupportedError: the map keeps no evidence (profile `paper`).
+            StorageError: the store does not take it.
+        """
+        changed = self._mapper.remove_robot(robot_id, commit=self._keep)
+        self._health.count("maps.robots_forgotten")
+        self._tell(changed)
+        log.info("robot_forgotten", map_id=self._map_id, robot_id=robot_id, n_tiles=len(changed.tiles))
+        return f"nothing from {robot_id} is left, {len(changed.tiles)} tiles changed"
+
+    def _keep(self, state: MapState) -> None:
+        self._keeper.replace(state, self._last_stamps)
 
     def _tell(self, changed: TileChange) -> None:
         snapshot = self._mapper.snapshot

@@ -396,6 +396,8 @@ def examples() -> dict[str, m.Message]:
     add(m.ControlRequest(timeout_s=5.0))
     add(m.ControlRequest(), "minimal")
     add(m.ControlRequest(name="before-the-rain"), "name")
+    add(m.ControlRequest(name="north-wing", T_map_saved=encode_array(np.eye(4))), "merge")
+    add(m.ControlRequest(robot="rover-1"), "forget")
     add(m.ControlReply(verb="clear", map_revision=32, message="5120 kernels removed"))
     add(m.ErrorReply(code=m.ErrorCode.BAD_POSE, message="the pose has NaN or infinite entries"))
     add(

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 DEFAULT_ROOT = "pot/v1"
 QUERY_OPS = ("integrate", "points", "grid", "rays", "risk", "params", "tiles", "atoms", "info")
-CONTROL_VERBS = ("save", "load", "clear", "drain")
+CONTROL_VERBS = ("save", "load", "clear", "drain", "merge", "forget")
 RESERVED_MAP_IDS = ("srv",)  # `<root>/srv/...` belongs to the servers
 _ID = re.compile(r"[a-z0-9][a-z0-9_.-]{0,62}\Z")
 _ROOT_CHUNK = re.compile(r"[^/*$#?@\s][^/*$#?\s]*\Z")

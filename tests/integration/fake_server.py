@@ -490,5 +490,24 @@ class FakeServer:
             self.revision += 1
         return [messages.ControlReply(verb="load", map_revision=self.revision, message=f"loaded {name}")]
 
+    def _reply_ctl_merge(self, payload: bytes) -> list[messages.Message]:
+        request = decode(payload, messages.ControlRequest)
+        if request.name is messages.ABSENT or request.name not in self.saved:
+            return [messages.ErrorReply(code=ErrorCode.UNKNOWN_MAP, message=f"no map {request.name}")]
+        at = np.zeros(3)
+        if request.T_map_saved is not messages.ABSENT:
+            at = decode_array(
+                request.T_map_saved, "T_map_saved", dtypes=(messages.DType.FLOAT64,), shape=(4, 4)
+            )[:3, 3]
+        return [
+            messages.ControlReply(
+                verb="merge", map_revision=self.revision, message=f"merged {request.name} at {at.tolist()}"
+            )
+        ]
+
+    def _reply_ctl_forget(self, payload: bytes) -> list[messages.Message]:
+        robot = decode(payload, messages.ControlRequest).robot
+        return [messages.ControlReply(verb="forget", map_revision=self.revision, message=f"forgot {robot}")]
+
     def _reply_ctl_drain(self, payload: bytes) -> list[messages.Message]:
         return [messages.ControlReply(verb="drain", map_revision=self.revision, message="drained")]

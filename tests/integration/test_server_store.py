@@ -103,6 +103,61 @@ def test_names_where_they_belong_and_nowhere_else(serve: Serve) -> None:
     _, client = serve()
     assert client.control("load").code is ErrorCode.BAD_MESSAGE
     assert client.control("clear", named("x")).code is ErrorCode.BAD_MESSAGE
+    assert client.control("merge").code is ErrorCode.BAD_MESSAGE
+    assert client.control("forget").code is ErrorCode.BAD_MESSAGE
+    assert client.control("forget", named("x")).code is ErrorCode.BAD_MESSAGE
+    assert client.control("load", messages.ControlRequest(name="x", robot="r1")).code is ErrorCode.BAD_MESSAGE
+    posed = messages.ControlRequest(name="x", T_map_saved=wire.encode_array(np.eye(4)))
+    assert client.control("load", posed).code is ErrorCode.BAD_MESSAGE
+
+
+def test_maps_merge_and_robots_are_forgotten_over_the_wire(serve: Serve) -> None:
+    _, client = serve()
+    client.one("integrate", make_cloud(seq=1, robot="r2"))
+    client.control("save", named("theirs"))
+    client.control("clear")
+    client.one("integrate", make_cloud(seq=1, robot="r1"))
+    alone = client.one("info")
+    pose = np.eye(4)
+    pose[0, 3] = 100.0
+    ticks = client.listen(client.keys.revision)
+    request = messages.ControlRequest(name="theirs", T_map_saved=wire.encode_array(pose))
+    reply = client.control("merge", request)
+    assert (reply.verb, reply.map_revision) == ("merge", alone.map_revision + 1)
+    (tick,) = drain(ticks, 1)
+    assert max(tile[0] for tile in tick.changed_tiles) >= 9
+    merged = client.one("info")
+    assert merged.n_scans == 2
+    assert merged.n_kernels > 1.8 * alone.n_kernels
+    there = points_query([[105.9, 0.0, 0.0]])
+    assert client.one("points", there).observed.data == b"\x01"
+    assert client.control("forget", messages.ControlRequest(robot="r2")).verb == "forget"
+    assert client.one("points", there).observed.data == b"\x00"
+    assert client.one("info").n_kernels == pytest.approx(alone.n_kernels, rel=0.02)
+    assert client.control("forget", messages.ControlRequest(robot="r3")).code is ErrorCode.UNKNOWN_ROBOT
+    assert client.control("merge", named("ours")).code is ErrorCode.UNKNOWN_MAP
+    skewed = messages.ControlRequest(name="theirs", T_map_saved=wire.encode_array(2.0 * pose))
+    assert client.control("merge", skewed).code is ErrorCode.BAD_POSE
+    counters = client.stats().counters
+    assert (counters["maps.merged"], counters["maps.robots_forgotten"]) == (1, 1)
+
+
+def test_what_was_merged_and_forgotten_is_so_after_a_restart(serve: Serve) -> None:
+    server, client = serve()
+    client.one("integrate", make_cloud(seq=1, robot="r1"))
+    client.control("save", named("mine"))
+    client.control("clear")
+    client.one("integrate", make_cloud(seq=1, robot="r2"))
+    client.control("merge", named("mine"))
+    client.control("forget", messages.ControlRequest(robot="r2"))
+    before = client.one("points", HERE)
+    client.close()
+    assert server.stop()
+    _, client = serve()
+    assert client.one("points", HERE).mean.data == before.mean.data
+    assert client.control("forget", messages.ControlRequest(robot="r2")).verb == "forget", (
+        "nothing is left to change"
+    )
 
 
 def test_a_cloud_that_the_disk_refuses_is_dropped_with_that_reason(serve: Serve) -> None:

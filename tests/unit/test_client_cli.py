@@ -284,10 +284,19 @@ def test_info_and_atoms(run: Run, tmp_path: Path) -> None:
 
 
 def test_map_verbs(run: Run) -> None:
-    assert run("map", "save", "here")[:2] == (0, "save: saved as here (revision 0)\n")
-    assert run("map", "load", "here")[:2] == (0, "load: loaded here (revision 1)\n")
-    assert run("map", "clear")[:2] == (0, "clear: cleared (revision 2)\n")
-    assert run("map", "drain")[:2] == (0, "drain: drained (revision 2)\n")
+    def said(*words: str) -> tuple[str, int]:
+        status, out, _ = run("map", *words)
+        assert status == 0
+        text, revision = re.fullmatch(r"(.*) \(revision (\d+)\)\n", out).groups()
+        return text, int(revision)
+
+    text, revision = said("save", "here")
+    assert text == "save: saved as here"
+    assert said("load", "here") == ("load: loaded here", revision + 1)
+    assert said("clear") == ("clear: cleared", revision + 2)
+    assert said("drain") == ("drain: drained", revision + 2)
+    assert said("merge", "here", "--pose", "1", "2", "0", "90")[0] == "merge: merged here at [1.0, 2.0, 0.0]"
+    assert said("forget", "rover-1")[0] == "forget: forgot rover-1"
     status, _, err = run("map", "load", "elsewhere")
     assert status == 1
     assert "no map elsewhere" in err
@@ -295,6 +304,13 @@ def test_map_verbs(run: Run) -> None:
     assert (status, "name a saved map" in err) == (2, True)
     status, _, err = run("map", "clear", "here")
     assert (status, "clear takes no name" in err) == (2, True)
+    for words, why in (
+        (("merge",), "name a saved map"),
+        (("forget",), "name a robot"),
+        (("load", "here", "--pose", "0", "0", "0", "0"), "load takes no pose"),
+    ):
+        status, _, err = run("map", *words)
+        assert (status, why in err) == (2, True)
 
 
 def test_watch_ends_by_itself(run: Run) -> None:

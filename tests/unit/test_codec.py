@@ -262,7 +262,7 @@ def test_an_empty_payload_is_a_message_of_defaults() -> None:
     codec.decode_stats_query(b"")
     assert codec.decode_atoms_query(b"", LIMITS) == (messages.AtomsAction.READ, None, None)
     assert codec.decode_params_query(b"") == (None, None, None)
-    assert codec.decode_control(b"") == (None, None)
+    assert codec.decode_control(b"") == (None, None, None, None)
     with pytest.raises(errors.BadMessageError):
         codec.decode_grid_query(b"")
 

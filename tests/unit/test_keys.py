@@ -34,7 +34,7 @@ def test_keys_are_the_contract() -> None:
 
 def test_operations_are_the_contract() -> None:
     assert QUERY_OPS == ("integrate", "points", "grid", "rays", "risk", "params", "tiles", "atoms", "info")
-    assert CONTROL_VERBS == ("save", "load", "clear", "drain")
+    assert CONTROL_VERBS == ("save", "load", "clear", "drain", "merge", "forget")
 
 
 @pytest.mark.parametrize("value", ["a", "0", "robot-1", "r_2.left", "a" * 63])

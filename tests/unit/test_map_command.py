@@ -264,3 +264,34 @@ def test_what_cannot_be_imported_says_why(tmp_path: Path, run: Run) -> None:
         places_of(_leaf((0, 0, 0), DEPTH, True), 0.1, 0.2, looks=0.0)
     with pytest.raises(SettingsError, match="coarser"):
         places_of(_leaf((0, 0, 0), 1, False), 0.1, 0.2)
+
+
+# --- merge ------------------------------------------------------------------------------------------------------------
+
+
+def test_two_saved_maps_become_one(tmp_path: Path, saved: Path, run: Run) -> None:
+    service = MappingService(settings=SETTINGS, threads=1)
+    service.integrate(make_scan(3, "eve"))
+    write_map(tmp_path / "eve.map", service.state, Origin("site", True, {"eve": 3}))
+    out = tmp_path / "both.map"
+    code, text, _ = run("merge", saved, tmp_path / "eve.map", "--pose", 100, 0, 0, 90, "-o", out)
+    assert code == 0
+    assert "tiles changed" in text
+    merged, alone = read_map(out), read_map(saved)
+    assert merged.record.stamps == {"ada": 1, "bob": 2, "eve": 3}
+    assert merged.state().n_scans == 3
+    assert merged.state().tiled.robots == ("ada", "bob", "eve")
+    hinge = np.concatenate([part.kernels.hinge_mean for part in merged.tiled.parts.values()])
+    near = np.linalg.norm(hinge[:, :2] - [100.0, 0.0], axis=1) < 50.0
+    assert near.sum() == pytest.approx(len(service.snapshot), rel=0.05)
+    assert (~near).sum() == pytest.approx(sum(len(t.kernels) for t in alone.tiled.tiles.values()), rel=0.05)
+
+
+def test_maps_of_two_kinds_are_not_merged(tmp_path: Path, saved: Path, run: Run) -> None:
+    paper = MappingService(settings=MappingSettings.of_profile("paper"), threads=1)
+    paper.integrate(make_scan(1, "ada"))
+    write_map(tmp_path / "paper.map", paper.state, Origin("site", False, {"ada": 1}))
+    code, _, err = run("merge", saved, tmp_path / "paper.map", "-o", tmp_path / "out.map")
+    assert code == 2
+    assert "cannot be merged" in err
+    assert not (tmp_path / "out.map").exists()
