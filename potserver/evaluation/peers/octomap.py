@@ -1,0 +1,71 @@
+"""OctoMap (Hornung et al. 2013), by its own library: clamped log-odds in voxels, every voxel of a scan counted once."""
+
+from __future__ import annotations
+
+import importlib
+from typing import Any
+
+import numpy as np
+
+from potclient.datasets import RecordedScan
+from potclient.results import Bool, Float64
+from potserver.errors import SettingsError
+from potserver.evaluation.mappers import Mapper, Size
+
+_SAME_LENGTH = 1e-3  # relative
+
+
+class OctoMap(Mapper):
+    """OctoMap with its library's own sensor model: hit 0.7, miss 0.4, clamped to 0.12 and 0.97.
+
+    End points are thinned to one a voxel first, as its `discretize` does. Beams without an echo are free up to their length.
+
+    Args:
+        resolution_m: Edge of a voxel.
+    Raises:
+        SettingsError: the library is not installed.
+    """
+
+    def __init__(self, resolution_m: float) -> None:
+        self.name = f"OctoMap {resolution_m:g} m"
+        try:
+            library: Any = importlib.import_module("pyoctomap")
+        except ImportError as error:
+            raise SettingsError(f"OctoMap needs its library: pip install 'potserver[peers]' ({error})") from error
+        self._tree = library.OcTree(resolution_m)
+        self._resolution_m = resolution_m
+
+    def integrate(self, scan: RecordedScan) -> dict[str, float]:
+        origin = scan.T_map_sensor[:3, 3].copy()
+        beams = scan.in_map - origin
+        reach_m = -1.0
+        if not scan.is_return.all():
+            # the library knows a beam without an echo as one that is longer than its reach
+            length = np.linalg.norm(beams[~scan.is_return], axis=1)
+            reach_m = float(length.max())
+            if length.min() < reach_m * (1 - _SAME_LENGTH):
+                raise SettingsError(
+                    f"OctoMap: beams without an echo of {length.min():.2f} to {reach_m:.2f} m in one scan; it takes those "
+                    "of one length: limit it with --max-range"
+                )
+            beams = np.where(scan.is_return[:, None], beams, beams * (1 + 2 * _SAME_LENGTH))
+            reach_m *= 1 + _SAME_LENGTH
+        ends = beams + origin
+        voxel = np.floor(ends / self._resolution_m).astype(np.int64)
+        first = np.unique(voxel, axis=0, return_index=True)[1]
+        self._tree.insertPointCloud(np.ascontiguousarray(ends[np.sort(first)]), origin, reach_m)
+        return {}
+
+    def occupancy(self, points: Float64) -> tuple[Float64, Bool]:
+        probability, known = np.full(len(points), 0.5), np.zeros(len(points), np.bool_)
+        search = self._tree.search
+        for i, point in enumerate(np.ascontiguousarray(points, np.float64)):
+            node = search(point)
+            if node is not None:
+                probability[i], known[i] = node.getOccupancy(), True
+        return np.clip(probability, 0.0, 1.0), known
+
+    def size(self) -> Size:
+        return Size(
+            int(self._tree.getNumLeafNodes()), len(self._tree.write()), len(self._tree.writeBinary())
+        )
