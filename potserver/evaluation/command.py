@@ -44,11 +44,11 @@ def run(options: argparse.Namespace, settings: Settings) -> list[Evaluation]:
         PotserverError: a map refuses a scan.
     """
     for name in (options.json, options.markdown):
-        if name is not None and not Path(name).absolute().parent.is_dir():  # asked before the work, not after it
+        if (
+            name is not None and not Path(name).absolute().parent.is_dir()
+        ):  # asked before the work, not after it
             raise SettingsError(f"cannot write {name}: no folder {Path(name).absolute().parent}")
-    dictionary = (
-        AtomDictionary.load(settings.dictionary) if settings.dictionary else AtomDictionary.builtin()
-    )
+    dictionary = AtomDictionary.load(settings.dictionary) if settings.dictionary else AtomDictionary.builtin()
     threads = settings.threads or default_threads()
     console = Console(highlight=False, width=None if sys.stdout.isatty() else 160)
     console.print(_machine(threads))

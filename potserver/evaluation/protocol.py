@@ -1,4 +1,4 @@
-"""The one protocol: all scans through all maps, scan by scan; at the end the maps are asked about beams that none of them saw."""
+"""The one protocol: all scans through all maps, scan by scan, and then questions about beams that none of them saw."""
 
 from __future__ import annotations
 
@@ -149,7 +149,7 @@ def evaluate(
         if isinstance(recording, TownRecording)
         else {}
     )
-    rows = []
+    rows: list[Row] = []
     for mapper in mappers:
         on_step(mapper.name)
         if mapper.is_batch:

@@ -1,4 +1,4 @@
-"""Bayesian generalised kernel inference (Doherty, Wang and Englot 2017): kernel-weighted counts of hits and free points in voxels."""
+"""Bayesian generalised kernel inference (Doherty, Wang and Englot 2017): kernel-weighted counts of labels in voxels."""
 
 from __future__ import annotations
 
@@ -52,9 +52,7 @@ class BgkMap(Mapper):
         hits = _thinned(ends[scan.is_return], self._edge_m)
         beams = np.concatenate([hits, _thinned(ends[~scan.is_return], self._edge_m)])
         free = _thinned(np.concatenate([origin[None], _along(origin, beams)]), self._edge_m)
-        self._add(
-            np.concatenate([hits, free]), np.arange(len(hits) + len(free)) < len(hits), scan.is_planar
-        )
+        self._add(np.concatenate([hits, free]), np.arange(len(hits) + len(free)) < len(hits), scan.is_planar)
         return {}
 
     def _add(self, points: Float64, occupied: Bool, planar: bool) -> None:
@@ -95,7 +93,9 @@ def _thinned(points: Float64, edge_m: float) -> Float64:
 def _along(origin: Float64, ends: Float64) -> Float64:
     """The free points of beams from the origin (3,) to ends (N, 3)."""
     length = np.linalg.norm(ends - origin, axis=1)
-    n = np.maximum(np.ceil(length / _FREE_STEP_M).astype(np.int64) - 1, 0)  # k steps, k = 1 .. while shorter than the beam
+    n = np.maximum(
+        np.ceil(length / _FREE_STEP_M).astype(np.int64) - 1, 0
+    )  # k steps, k = 1 .. while shorter than the beam
     beam = np.repeat(np.arange(len(ends)), n)
     step = 1 + np.arange(len(beam)) - np.repeat(np.cumsum(n) - n, n)
     last = np.flatnonzero(length > _FREE_STEP_M)
@@ -107,7 +107,7 @@ def _along(origin: Float64, ends: Float64) -> Float64:
 @nb.njit(nogil=True, error_model="numpy", cache=True)
 def _count(points, occupied, done, edge, length, planar, keys, counts, table, n):
     """From point `done` on; how many are done, and the entries in use. Stops early where the entries may not suffice."""
-    reach = int(math.ceil(length / edge))
+    reach = math.ceil(length / edge)
     reach_z = 0 if planar else reach
     most = (2 * reach + 1) ** 2 * (2 * reach_z + 1)
     for i in range(done, len(points)):
@@ -125,7 +125,9 @@ def _count(points, occupied, done, edge, length, planar, keys, counts, table, n)
                     if d >= 1.0:
                         continue
                     turn = 2.0 * math.pi * d
-                    weight = _SCALE * ((2.0 + math.cos(turn)) * (1.0 - d) / 3.0 + math.sin(turn) / (2.0 * math.pi))
+                    weight = _SCALE * (
+                        (2.0 + math.cos(turn)) * (1.0 - d) / 3.0 + math.sin(turn) / (2.0 * math.pi)
+                    )
                     if weight <= 0.0:
                         continue
                     key = pack(0, kx, ky, kz)
@@ -145,7 +147,9 @@ def _look_up(points, edge, keys, counts, table):
     out = np.zeros((len(points), 2), np.float32)
     for i in range(len(points)):
         x, y, z = points[i]
-        entry = table[find(table, keys, pack(0, math.floor(x / edge), math.floor(y / edge), math.floor(z / edge)))]
+        entry = table[
+            find(table, keys, pack(0, math.floor(x / edge), math.floor(y / edge), math.floor(z / edge)))
+        ]
         if entry >= 0:
             out[i] = counts[entry]
     return out

@@ -8,9 +8,9 @@ import numpy as np
 
 from potclient.datasets import RecordedScan
 from potclient.results import Bool, Float64
-from potserver.evaluation.mappers import Mapper, Size, kernel_bytes
 from potserver.domain.kernel_map import KernelMap
 from potserver.domain.types import KernelSet
+from potserver.evaluation.mappers import Mapper, Size, kernel_bytes
 from potserver.numerics.kernel_index import sparse_features
 from potserver.numerics.lattice_nodes import new_nodes
 from potserver.numerics.logistic import fit_sparse
@@ -26,7 +26,7 @@ _FINEST_M, _COARSEST_M, _HALVINGS = 0.02, 10.0, 14
 
 
 class GridMap(Mapper):
-    """Kernels on a coarse lattice about all data and a finer one at hits; weights jointly solved on a sample of all scans' points.
+    """Kernels on a coarse lattice about all data and a finer one at hits, solved jointly on a sample of all scans' points.
 
     It is given as many kernels as the first map of the table has, by the choice of the lattices' spacing.
 

@@ -31,7 +31,9 @@ class OctoMap(Mapper):
         try:
             library: Any = importlib.import_module("pyoctomap")
         except ImportError as error:
-            raise SettingsError(f"OctoMap needs its library: pip install 'potserver[peers]' ({error})") from error
+            raise SettingsError(
+                f"OctoMap needs its library: pip install 'potserver[peers]' ({error})"
+            ) from error
         self._tree = library.OcTree(resolution_m)
         self._resolution_m = resolution_m
 
@@ -66,6 +68,4 @@ class OctoMap(Mapper):
         return np.clip(probability, 0.0, 1.0), known
 
     def size(self) -> Size:
-        return Size(
-            int(self._tree.getNumLeafNodes()), len(self._tree.write()), len(self._tree.writeBinary())
-        )
+        return Size(int(self._tree.getNumLeafNodes()), len(self._tree.write()), len(self._tree.writeBinary()))
