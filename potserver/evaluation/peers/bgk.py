@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from potclient.datasets import RecordedScan
 from potclient.results import Bool, Float64
 from potserver.evaluation.mappers import Mapper, Size
-from potserver.numerics.voxel_hash import empty_table, enter, find, pack
+from potserver.numerics.voxel_hash import empty_table, find, pack
 
 _SCALE = 1.0  # of the kernel
 _LENGTH_PER_RESOLUTION = 2.0
@@ -68,7 +68,7 @@ class BgkMap(Mapper):
             self._keys = np.concatenate([self._keys, np.zeros_like(self._keys)])
             self._counts = np.concatenate([self._counts, np.zeros_like(self._counts)])
             self._table = empty_table(len(self._keys))
-            enter(self._table, self._keys, self._n)
+            _enter(self._table, self._keys, self._n)
 
     def occupancy(self, points: Float64) -> tuple[Float64, Bool]:
         counts = _look_up(np.ascontiguousarray(points), self._edge_m, self._keys, self._counts, self._table)
@@ -140,6 +140,12 @@ def _count(points, occupied, done, edge, length, planar, keys, counts, table, n)
                         n += 1
                     counts[entry, 1 if occupied[i] else 0] += np.float32(weight)
     return len(points), n
+
+
+@nb.njit(nogil=True, error_model="numpy", cache=True)
+def _enter(table, keys, n):
+    for entry in range(n):
+        table[find(table, keys, keys[entry])] = entry
 
 
 @nb.njit(nogil=True, error_model="numpy", cache=True)
