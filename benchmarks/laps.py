@@ -63,7 +63,9 @@ def main() -> int:
                 **metrics._asdict(),
             }
         )
-    console.print(f"{len(ways)} scans a lap, {sum(map(len, ways)):,} beams, {options.sensor}, {options.threads} threads")
+    console.print(
+        f"{len(ways)} scans a lap, {sum(map(len, ways)):,} beams, {options.sensor}, {options.threads} threads"
+    )
     console.print(_table(laps))
     for line in _verdict(laps):
         console.print(line)
@@ -76,12 +78,16 @@ def main() -> int:
 
 
 def _options() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--style", default="terraces")
     parser.add_argument("--seed", type=int, default=7)
     parser.add_argument("--laps", type=int, default=20)
     parser.add_argument("--every", type=float, default=4.0, metavar="M", help="distance of scans [4]")
-    parser.add_argument("--sensor", choices=sorted(n for n, s in SENSORS.items() if not s.is_planar), default="vlp16")
+    parser.add_argument(
+        "--sensor", choices=sorted(n for n, s in SENSORS.items() if not s.is_planar), default="vlp16"
+    )
     parser.add_argument("--max-range", type=float, default=25.0, metavar="M")
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--json", metavar="FILE", help="write the numbers")
@@ -120,9 +126,13 @@ def _loop(town: Town) -> Drive:
     return Drive(corners(cell), [0.0, radius, radius, radius, radius, 0.0], length_m(cell) - 1e-6)
 
 
-def _with_noise(scan: RecordedScan, noise_m: float, max_range_m: float, seed: tuple[int, int]) -> RecordedScan:
+def _with_noise(
+    scan: RecordedScan, noise_m: float, max_range_m: float, seed: tuple[int, int]
+) -> RecordedScan:
     range_m = np.linalg.norm(scan.points, axis=1)
-    measured = range_m + np.where(scan.is_return, np.random.default_rng(seed).normal(0.0, noise_m, len(range_m)), 0.0)
+    measured = range_m + np.where(
+        scan.is_return, np.random.default_rng(seed).normal(0.0, noise_m, len(range_m)), 0.0
+    )
     share = np.clip(measured, 0.1, max_range_m) / range_m
     return dataclasses.replace(scan, points=(scan.points * share[:, None]).astype(np.float32))
 
@@ -190,7 +200,11 @@ def _draw(laps: list[dict[str, Any]], path: str) -> None:
     times = [lap["scan_ms"] for lap in laps]
     axes[1].plot(number, [np.median(ms) for ms in times], "o-", label="ms a scan, median")
     axes[1].fill_between(
-        number, [np.quantile(ms, 0.05) for ms in times], [np.quantile(ms, 0.95) for ms in times], alpha=0.15, lw=0
+        number,
+        [np.quantile(ms, 0.05) for ms in times],
+        [np.quantile(ms, 0.95) for ms in times],
+        alpha=0.15,
+        lw=0,
     )
     axes[2].plot(number, [lap["nll"] for lap in laps], "o-", color="tab:red", label="held-out NLL, nats")
     axes[3].plot(number, [lap["auc"] for lap in laps], "o-", color="tab:green", label="held-out AUC")

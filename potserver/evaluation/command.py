@@ -32,7 +32,20 @@ from potserver.evaluation.protocol import Evaluation, Row, evaluate
 from potserver.numerics.threads import default_threads
 from potserver.services.settings import MappingSettings
 
-_HELD_OUT = ("map", "kernels", "bytes", "ms/scan", "[range]", "ACC", "AUC", "NLL", "Brier", "ECE", "unknown")
+_HELD_OUT = (
+    "map",
+    "kernels",
+    "bytes",
+    "ms/scan",
+    "[range]",
+    "CPU ms",
+    "ACC",
+    "AUC",
+    "NLL",
+    "Brier",
+    "ECE",
+    "unknown",
+)
 _TRUTH = {"uniform": "uniform", "near_surfaces": "near surfaces"}
 
 
@@ -201,7 +214,7 @@ def _held_out_cells(row: Row) -> list[str]:
     m = row.held_out
     spread = "batch" if row.is_batch else f"[{min(row.scan_ms):.0f}-{max(row.scan_ms):.0f}]"
     return [
-        row.name, f"{row.size.cells:,}", f"{row.size.n_bytes:,}", f"{np.median(row.scan_ms):.0f}", spread,
+        row.name, f"{row.size.cells:,}", f"{row.size.n_bytes:,}", f"{np.median(row.scan_ms):.0f}", spread, f"{np.median(row.cpu_ms):.0f}",
         f"{m.accuracy:.3f}", f"{m.auc:.4f}", f"{m.nll:.3f}", f"{m.brier:.3f}", f"{m.ece:.3f}", f"{m.share_unknown:.1%}",
     ]  # fmt: skip
 

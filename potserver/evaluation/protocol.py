@@ -42,7 +42,8 @@ class Row:
     name: str
     is_batch: bool
     size: Size
-    scan_ms: list[float]  # a batch fit is shared out evenly
+    scan_ms: list[float]  # by the clock on the wall; a batch fit is shared out evenly
+    cpu_ms: list[float]  # processor time of all threads, which other programs on the machine hardly change
     stage_ms: dict[str, float]  # medians
     held_out: Metrics
     rays: RayScores | None  # of maps that can be asked for rays
@@ -55,6 +56,7 @@ class Row:
             "is_batch": self.is_batch,
             **self.size._asdict(),
             "scan_ms": self.scan_ms,
+            "cpu_ms": self.cpu_ms,
             "stage_ms": self.stage_ms,
             "held_out": self.held_out._asdict(),
             "rays": None if self.rays is None else self.rays._asdict(),
@@ -81,6 +83,19 @@ class Evaluation:
             "path_m": self.path_m,
             "rows": [row.to_json() for row in self.rows],
         }
+
+
+class _Took(NamedTuple):
+    wall_ms: float
+    cpu_ms: float
+
+    @staticmethod
+    def now() -> _Took:
+        return _Took(time.perf_counter() * 1e3, time.process_time() * 1e3)
+
+    def until_now(self) -> _Took:
+        now = _Took.now()
+        return _Took(now.wall_ms - self.wall_ms, now.cpu_ms - self.cpu_ms)
 
 
 class _Beams(NamedTuple):
@@ -118,7 +133,7 @@ def evaluate(
         DatasetError: a scan cannot be read.
         PotserverError: a map refuses a scan.
     """
-    times: dict[str, list[float]] = {mapper.name: [] for mapper in mappers}
+    times: dict[str, list[_Took]] = {mapper.name: [] for mapper in mappers}
     stages: dict[str, list[dict[str, float]]] = {mapper.name: [] for mapper in mappers}
     labels: list[LabelledPoints] = []
     beams: list[_Beams] = []
@@ -136,9 +151,9 @@ def evaluate(
         track.append(scan.T_map_sensor[:3, 3])
         n_beams += len(scan)
         for mapper in mappers:
-            start = time.perf_counter()
+            start = _Took.now()
             stages[mapper.name].append(mapper.integrate(scan))
-            times[mapper.name].append((time.perf_counter() - start) * 1e3)
+            times[mapper.name].append(start.until_now())
         last = whole
     tests = LabelledPoints.concatenate(labels)
     if not len(tests):
@@ -152,17 +167,17 @@ def evaluate(
     rows: list[Row] = []
     for mapper in mappers:
         on_step(mapper.name)
-        if mapper.is_batch:
-            start = time.perf_counter()
-            mapper.finish(rows[0].size.cells if rows else 0)
-            share = (time.perf_counter() - start) * 1e3 / len(track)
-            times[mapper.name] = [ms + share for ms in times[mapper.name]]
+        start = _Took.now()
+        mapper.finish(rows[0].size.cells if rows else 0)
+        share = start.until_now() if mapper.is_batch else _Took(0.0, 0.0)
+        took = np.array(times[mapper.name]) + np.array(share) / len(track)
         rows.append(
             Row(
                 name=mapper.name,
                 is_batch=mapper.is_batch,
                 size=mapper.size(),
-                scan_ms=times[mapper.name],
+                scan_ms=took[:, 0].tolist(),
+                cpu_ms=took[:, 1].tolist(),
                 stage_ms=_medians(stages[mapper.name]),
                 held_out=_score(mapper, tests),
                 rays=None if mapper.kernel_map is None else _score_rays(mapper.kernel_map, held_beams),

@@ -83,10 +83,13 @@ def _thinned(points: Float64, edge_m: float) -> Float64:
     """The mean of the points in each voxel."""
     if not len(points):
         return points
+    cell = np.floor(points / edge_m).astype(np.int64)
+    cell -= cell.min(axis=0)
     _, of, n = np.unique(
-        np.floor(points / edge_m).astype(np.int64), axis=0, return_inverse=True, return_counts=True
+        np.ravel_multi_index(tuple(cell.T), tuple(cell.max(axis=0) + 1)),
+        return_inverse=True,
+        return_counts=True,
     )
-    of = of.reshape(-1)
     return np.stack([np.bincount(of, points[:, axis]) / n for axis in range(3)], axis=1)
 
 
@@ -121,9 +124,10 @@ def _count(points, occupied, done, edge, length, planar, keys, counts, table, n)
                     dx, dy = (kx + 0.5) * edge - x, (ky + 0.5) * edge - y
                     # a planar map is a map of columns
                     dz = 0.0 if planar else (kz + 0.5) * edge - z
-                    d = math.sqrt(dx * dx + dy * dy + dz * dz) / length
-                    if d >= 1.0:
+                    square = dx * dx + dy * dy + dz * dz
+                    if square >= length * length:
                         continue
+                    d = math.sqrt(square) / length
                     turn = 2.0 * math.pi * d
                     weight = _SCALE * (
                         (2.0 + math.cos(turn)) * (1.0 - d) / 3.0 + math.sin(turn) / (2.0 * math.pi)

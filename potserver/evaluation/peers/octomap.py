@@ -11,6 +11,7 @@ from potclient.datasets import RecordedScan
 from potclient.results import Bool, Float64
 from potserver.errors import SettingsError
 from potserver.evaluation.mappers import Mapper, Size
+from potserver.numerics.geometry import voxel_pick
 
 _SAME_LENGTH = 1e-3  # relative
 
@@ -53,9 +54,7 @@ class OctoMap(Mapper):
             beams = np.where(scan.is_return[:, None], beams, beams * (1 + 2 * _SAME_LENGTH))
             reach_m *= 1 + _SAME_LENGTH
         ends = beams + origin
-        voxel = np.floor(ends / self._resolution_m).astype(np.int64)
-        first = np.unique(voxel, axis=0, return_index=True)[1]
-        self._tree.insertPointCloud(np.ascontiguousarray(ends[np.sort(first)]), origin, reach_m)
+        self._tree.insertPointCloud(ends[voxel_pick(ends, self._resolution_m)], origin, reach_m)
         return {}
 
     def occupancy(self, points: Float64) -> tuple[Float64, Bool]:
