@@ -213,10 +213,16 @@ def _tables(evaluation: Evaluation) -> Iterator[tuple[list[str], list[list[str]]
 def _held_out_cells(row: Row) -> list[str]:
     m = row.held_out
     spread = "batch" if row.is_batch else f"[{min(row.scan_ms):.0f}-{max(row.scan_ms):.0f}]"
+    times = [f"{np.median(row.scan_ms):.0f}", spread, f"{np.median(row.cpu_ms):.0f}"]
+    scores = [f"{m.accuracy:.3f}", f"{m.auc:.4f}", f"{m.nll:.3f}", f"{m.brier:.3f}", f"{m.ece:.3f}"]
     return [
-        row.name, f"{row.size.cells:,}", f"{row.size.n_bytes:,}", f"{np.median(row.scan_ms):.0f}", spread, f"{np.median(row.cpu_ms):.0f}",
-        f"{m.accuracy:.3f}", f"{m.auc:.4f}", f"{m.nll:.3f}", f"{m.brier:.3f}", f"{m.ece:.3f}", f"{m.share_unknown:.1%}",
-    ]  # fmt: skip
+        row.name,
+        f"{row.size.cells:,}",
+        f"{row.size.n_bytes:,}",
+        *times,
+        *scores,
+        f"{m.share_unknown:.1%}",
+    ]
 
 
 def _number(value: float) -> str:

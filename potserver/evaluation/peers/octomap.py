@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import importlib
+import tempfile
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,7 +21,8 @@ _SAME_LENGTH = 1e-3  # relative
 class OctoMap(Mapper):
     """OctoMap with its library's own sensor model: hit 0.7, miss 0.4, clamped to 0.12 and 0.97.
 
-    End points are thinned to one a voxel first, as its `discretize` does. Beams without an echo are free up to their length.
+    End points are put into the middle of their voxel and taken once, as its `discretize` does. Beams without an echo are free up
+    to their length.
 
     Args:
         resolution_m: Edge of a voxel.
@@ -53,7 +56,7 @@ class OctoMap(Mapper):
                 )
             beams = np.where(scan.is_return[:, None], beams, beams * (1 + 2 * _SAME_LENGTH))
             reach_m *= 1 + _SAME_LENGTH
-        ends = beams + origin
+        ends = _centred(beams + origin, origin, scan.is_return, reach_m, self._resolution_m)
         self._tree.insertPointCloud(ends[voxel_pick(ends, self._resolution_m)], origin, reach_m)
         return {}
 
@@ -67,4 +70,17 @@ class OctoMap(Mapper):
         return np.clip(probability, 0.0, 1.0), known
 
     def size(self) -> Size:
-        return Size(int(self._tree.getNumLeafNodes()), len(self._tree.write()), len(self._tree.writeBinary()))
+        with tempfile.TemporaryDirectory() as folder:
+            path = str(Path(folder) / "copy.ot")
+            self._tree.write(path)
+            n_bytes = Path(path).stat().st_size
+            # of a copy: writing a binary file leaves nothing but occupied and free in the tree itself
+            binary = self._tree.read(path).writeBinary()
+        return Size(int(self._tree.getNumLeafNodes()), n_bytes, len(binary))
+
+
+def _centred(ends: Float64, origin: Float64, is_return: Bool, reach_m: float, edge_m: float) -> Float64:
+    """End points with an echo in the middle of their voxels, where that is not beyond the reach."""
+    centre = (np.floor(ends / edge_m) + 0.5) * edge_m
+    moved = is_return & ((reach_m < 0) | (np.linalg.norm(centre - origin, axis=1) < reach_m))
+    return np.where(moved[:, None], centre, ends)
