@@ -21,8 +21,8 @@ _SAME_LENGTH = 1e-3  # relative
 class OctoMap(Mapper):
     """OctoMap with its library's own sensor model: hit 0.7, miss 0.4, clamped to 0.12 and 0.97.
 
-    End points are put into the middle of their voxel and taken once, as its `discretize` does. Beams without an echo are free up
-    to their length.
+    End points are put into the middle of their voxel and taken once, as its `discretize` does. Beams without an echo are free
+    up to their length.
 
     Args:
         resolution_m: Edge of a voxel.
