@@ -14,6 +14,7 @@ import dataclasses
 import json
 import sys
 import time
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -58,7 +59,7 @@ def main() -> int:
         laps.append(
             {
                 "kernels": len(service.snapshot),
-                "map_bytes": _bytes_of(service.state.tiled),
+                "map_bytes": _bytes_of(service.state.tiled.tiles),
                 "scan_ms": times,
                 **metrics._asdict(),
             }
@@ -149,7 +150,7 @@ def _bytes_of(value: Any) -> int:
             return part.nbytes
         if dataclasses.is_dataclass(part):
             return sum(count(getattr(part, field.name)) for field in dataclasses.fields(part))
-        if isinstance(part, dict):
+        if isinstance(part, Mapping):
             return sum(map(count, part.values()))
         if isinstance(part, (tuple, list)):
             return sum(map(count, part))
@@ -173,6 +174,8 @@ def _table(laps: list[dict[str, Any]]) -> Table:
 
 def _verdict(laps: list[dict[str, Any]]) -> list[str]:
     settled = laps[_SETTLED - 1 :]
+    if len(settled) < 2:
+        return [f"nothing to compare before lap {_SETTLED + 1}"]
     lines = []
     for name, value in (
         ("kernels", lambda lap: lap["kernels"]),
