@@ -72,7 +72,7 @@ def run(options: argparse.Namespace, settings: Settings) -> list[Evaluation]:
         except (DatasetError, UsageError) as error:
             raise SettingsError(f"{dataset}: {error}") from error
         found.append(evaluation)
-        _print(evaluation, console)
+        _print(evaluation, console, settings.mapping)
     if options.json is not None:
         Path(options.json).write_text(json.dumps(_report(found, options, threads), indent=1) + "\n")
     if options.markdown is not None:
@@ -161,7 +161,7 @@ def _progress(dataset: str, steps: int) -> Iterator[Callable[[str], None]]:
 # --- what is shown -------------------------------------------------------------------------------------------------------
 
 
-def _print(evaluation: Evaluation, console: Console) -> None:
+def _print(evaluation: Evaluation, console: Console, mapping: MappingSettings) -> None:
     console.print(f"\n[bold]{_title(evaluation)}[/bold]")
     for heads, lines in _tables(evaluation):
         table = Table(box=None, pad_edge=False, header_style="dim")
@@ -170,6 +170,11 @@ def _print(evaluation: Evaluation, console: Console) -> None:
         for line in lines:
             table.add_row(*(cell.replace("[", r"\[") for cell in line))
         console.print(table)
+    if evaluation.reach_m > mapping.max_range_m * 1.001:
+        console.print(
+            f"Our maps look {mapping.max_range_m:g} m far, the held-out beams are up to {evaluation.reach_m:.1f} m long: "
+            "set --max-range, or mapping.max_range_m."
+        )
     stages = evaluation.rows[0].stage_ms
     if stages:
         console.print(

@@ -72,6 +72,7 @@ class Evaluation:
     n_scans: int
     n_beams: int  # mapped, of all scans
     path_m: float  # that the sensor travelled
+    reach_m: float  # of the longest held-out beam
     rows: list[Row]
 
     def to_json(self) -> dict[str, Any]:
@@ -81,6 +82,7 @@ class Evaluation:
             "n_scans": self.n_scans,
             "n_beams": self.n_beams,
             "path_m": self.path_m,
+            "reach_m": self.reach_m,
             "rows": [row.to_json() for row in self.rows],
         }
 
@@ -190,6 +192,7 @@ def evaluate(
         n_scans=len(track),
         n_beams=n_beams,
         path_m=float(np.linalg.norm(steps, axis=1).sum()),
+        reach_m=float(_lengths(held_beams).max()),
         rows=rows,
     )
 
@@ -201,6 +204,10 @@ def _thinned(scan: RecordedScan, thin: int) -> RecordedScan:
 def _held_beams(scan: RecordedScan, held: Bool) -> _Beams:
     ends = scan.in_map[held]
     return _Beams(np.broadcast_to(scan.T_map_sensor[:3, 3], ends.shape), ends, scan.is_return[held])
+
+
+def _lengths(beams: _Beams) -> Float64:
+    return np.asarray(np.linalg.norm(beams.ends - beams.origins, axis=1))
 
 
 def _medians(stages: list[dict[str, float]]) -> dict[str, float]:
@@ -220,15 +227,10 @@ def _score_rays(kernel_map: KernelMap, beams: _Beams) -> RayScores:
     rng = np.random.default_rng(0)
     returned = _drawn(beams, beams.is_return, rng)
     free = _drawn(beams, ~beams.is_return, rng)
-    reach_m = float(np.linalg.norm(beams.ends - beams.origins, axis=1).max())
+    reach_m = float(_lengths(beams).max())
     return RayScores(
         false_return=_mean(_first_returns(kernel_map, free, reach_m)[0]),
-        range_error_m=_median(
-            np.abs(
-                _first_returns(kernel_map, returned, reach_m)[1]
-                - np.linalg.norm(returned.ends - returned.origins, axis=1)
-            )
-        ),
+        range_error_m=_median(np.abs(_first_returns(kernel_map, returned, reach_m)[1] - _lengths(returned))),
         n_free=len(free.ends),
         n_returns=len(returned.ends),
     )
@@ -243,7 +245,7 @@ def _drawn(beams: _Beams, chosen: Bool, rng: np.random.Generator) -> _Beams:
 
 def _first_returns(kernel_map: KernelMap, beams: _Beams, reach_m: float) -> tuple[Float64, Float64]:
     """(N,) probability of a return within a beam's length (with an echo: within `reach_m`), and (N,) m, the expected range."""
-    length = np.linalg.norm(beams.ends - beams.origins, axis=1)
+    length = _lengths(beams)
     probability, mean_m = np.zeros(len(length)), np.zeros(len(length))
     for start in range(0, len(length), _RAYS_AT_A_TIME):
         part = slice(start, start + _RAYS_AT_A_TIME)

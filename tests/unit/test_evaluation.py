@@ -126,6 +126,7 @@ def test_stages_are_medians_and_the_way_is_as_long_as_the_poses_say() -> None:
     found = evaluate("wall", Wall(), range(3), [Oracle()], hold_out=HoldOut())
     assert found.rows[0].stage_ms == {"look": 2.0}
     assert found.path_m == pytest.approx(1.0)
+    assert found.reach_m == pytest.approx(10.0)
     assert found.n_scans == 3
 
 
@@ -250,6 +251,13 @@ def test_the_command_prints_a_row_a_map_and_writes_all_numbers(
     assert rows[2]["cells"] == pytest.approx(rows[0]["cells"], rel=0.1)
     assert "label" in text  # the stages of ours
     assert f"| {rows[0]['held_out']['auc']:.4f} |" in document.read_text()
+
+
+def test_held_out_beams_beyond_the_maps_reach_are_pointed_out(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("--set", "mapping.max_range_m=9") == 0
+    assert "look 9 m far" in capsys.readouterr().out
+    assert run("--set", "mapping.max_range_m=9", "--max-range", "9") == 0
+    assert "m far" not in capsys.readouterr().out
 
 
 def test_tables_of_a_document_have_as_many_cells_as_heads() -> None:
