@@ -612,7 +612,7 @@ def _add_eval_flags(parser: argparse.ArgumentParser) -> None:
         type=lambda text: [name for name in text.split(",") if name],
         default=[],
         metavar="LIST",
-        help="other maps: octomap:METRES, bgk:METRES, grid; with commas",
+        help="other maps: octomap:METRES, bgk:METRES, bgk-gap:METRES, grid; with commas",
     )
     what.add_argument("--settings", metavar="FILE", help="TOML settings file (also POTSERVER_SETTINGS)")
     what.add_argument("--dictionary", metavar="FILE", help="atom dictionary [the built-in atoms]")

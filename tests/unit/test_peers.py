@@ -145,6 +145,15 @@ def test_bgk_puts_free_points_along_beams_with_or_without_an_echo() -> None:
     assert math.isnan(at(a_map, 0.05, 1.25, 0.05))
 
 
+def test_bgk_with_a_gap_has_no_free_points_there() -> None:
+    close, gap = BgkMap(0.1), BgkMap(0.1, gap_m=0.5)
+    for a_map in (close, gap):
+        a_map.integrate(scan([[1.15, 0.05, 0.05]]))
+    assert at(close, 1.05, 0.05, 0.05) < 0.5  # the point 1 m along the beam of 1.1 m
+    assert at(gap, 1.05, 0.05, 0.05) > 0.5
+    assert at(gap, 0.55, 0.05, 0.05) < 0.5
+
+
 def test_bgk_keeps_its_counts_as_it_grows() -> None:
     ends = np.random.default_rng(0).uniform(-20, 20, (3000, 3)).round(1) + 0.05
     a_map = BgkMap(0.1)
@@ -190,6 +199,7 @@ def test_the_grid_samples_all_scans_alike() -> None:
 def test_peers_are_named_with_their_resolution() -> None:
     assert peer_named("bgk", threads=1).name == "BGK 0.1 m"
     assert peer_named("bgk:0.25", threads=1).name == "BGK 0.25 m"
+    assert peer_named("bgk-gap:0.2", threads=1).name == "BGK 0.2 m, 0.5 m gap"
     assert peer_named("grid", threads=1).is_batch
 
 

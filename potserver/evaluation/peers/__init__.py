@@ -10,12 +10,16 @@ from potserver.evaluation.peers.bgk import BgkMap
 from potserver.evaluation.peers.grid import GridMap
 from potserver.evaluation.peers.octomap import OctoMap
 
-_WITH_RESOLUTION: dict[str, Callable[[float], Mapper]] = {"octomap": OctoMap, "bgk": BgkMap}
-DEFAULT_RESOLUTION_M = {"octomap": 0.1, "bgk": 0.1}
+_DEFAULT_RESOLUTION_M = 0.1
+_WITH_RESOLUTION: dict[str, Callable[[float], Mapper]] = {
+    "octomap": OctoMap,
+    "bgk": BgkMap,
+    "bgk-gap": lambda resolution_m: BgkMap(resolution_m, gap_m=0.5),
+}
 
 
 def peer_named(text: str, *, threads: int) -> Mapper:
-    """A peer from what the command line says: `octomap[:M]`, `bgk[:M]` with a resolution in m, or `grid`.
+    """A peer from what the command line says: `octomap[:M]`, `bgk[:M]`, `bgk-gap[:M]` with a resolution in m, or `grid`.
 
     Raises:
         SettingsError: no such peer, a resolution that is none, or a library that is not installed.
@@ -24,9 +28,11 @@ def peer_named(text: str, *, threads: int) -> Mapper:
     if name == "grid" and not resolution:
         return GridMap(threads=threads)
     if name not in _WITH_RESOLUTION:
-        raise SettingsError(f"no peer {text!r}; there are octomap:METRES, bgk:METRES and grid")
+        raise SettingsError(
+            f"no peer {text!r}; there are octomap:METRES, bgk:METRES, bgk-gap:METRES and grid"
+        )
     try:
-        edge_m = float(resolution) if resolution else DEFAULT_RESOLUTION_M[name]
+        edge_m = float(resolution) if resolution else _DEFAULT_RESOLUTION_M
     except ValueError:
         raise SettingsError(f"peer {text!r}: {resolution!r} is not a number of metres") from None
     if not 0.01 <= edge_m <= 10.0:
