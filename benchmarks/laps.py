@@ -50,9 +50,9 @@ def main() -> int:
         for k, exact in enumerate(ways):
             scan, held = hold_out.split(_with_noise(exact, noise_m, options.max_range, (lap, k)), k)
             labels.append(held)
-            start = time.perf_counter()
+            start = time.process_time()  # other programs on the machine hardly change it
             service.integrate(to_scan(scan, lap * len(ways) + k))
-            times.append((time.perf_counter() - start) * 1e3)
+            times.append((time.process_time() - start) * 1e3)
         tests = LabelledPoints.concatenate(labels)
         answer = service.snapshot.occupancy(tests.points)
         metrics = score(answer.mean, tests.occupied, answer.observed)
@@ -60,7 +60,7 @@ def main() -> int:
             {
                 "kernels": len(service.snapshot),
                 "map_bytes": _bytes_of(service.state.tiled.tiles),
-                "scan_ms": times,
+                "cpu_ms": times,
                 **metrics._asdict(),
             }
         )
@@ -161,12 +161,12 @@ def _bytes_of(value: Any) -> int:
 
 def _table(laps: list[dict[str, Any]]) -> Table:
     table = Table(box=None, pad_edge=False, header_style="dim")
-    for name in ("lap", "kernels", "map MB", "ms/scan", "95 %", "ACC", "AUC", "NLL", "ECE"):
+    for name in ("lap", "kernels", "map MB", "CPU ms/scan", "95 %", "ACC", "AUC", "NLL", "ECE"):
         table.add_column(name, justify="right")
     for k, lap in enumerate(laps):
         table.add_row(
-            str(k + 1), f"{lap['kernels']:,}", f"{lap['map_bytes'] / 1e6:.2f}", f"{np.median(lap['scan_ms']):.0f}",
-            f"{np.quantile(lap['scan_ms'], 0.95):.0f}", f"{lap['accuracy']:.4f}", f"{lap['auc']:.5f}", f"{lap['nll']:.4f}",
+            str(k + 1), f"{lap['kernels']:,}", f"{lap['map_bytes'] / 1e6:.2f}", f"{np.median(lap['cpu_ms']):.0f}",
+            f"{np.quantile(lap['cpu_ms'], 0.95):.0f}", f"{lap['accuracy']:.4f}", f"{lap['auc']:.5f}", f"{lap['nll']:.4f}",
             f"{lap['ece']:.4f}",
         )  # fmt: skip
     return table
@@ -180,7 +180,7 @@ def _verdict(laps: list[dict[str, Any]]) -> list[str]:
     for name, value in (
         ("kernels", lambda lap: lap["kernels"]),
         ("map bytes", lambda lap: lap["map_bytes"]),
-        ("ms/scan", lambda lap: float(np.median(lap["scan_ms"]))),
+        ("CPU ms/scan", lambda lap: float(np.median(lap["cpu_ms"]))),
         ("NLL", lambda lap: lap["nll"]),
         ("AUC", lambda lap: lap["auc"]),
     ):
@@ -200,8 +200,8 @@ def _draw(laps: list[dict[str, Any]], path: str) -> None:
     number = np.arange(1, len(laps) + 1)
     axes[0].plot(number, [lap["kernels"] / 1e3 for lap in laps], "o-", label="kernels, thousands")
     axes[0].plot(number, [lap["map_bytes"] / 1e6 for lap in laps], "s-", label="map, MB")
-    times = [lap["scan_ms"] for lap in laps]
-    axes[1].plot(number, [np.median(ms) for ms in times], "o-", label="ms a scan, median")
+    times = [lap["cpu_ms"] for lap in laps]
+    axes[1].plot(number, [np.median(ms) for ms in times], "o-", label="processor ms a scan, median")
     axes[1].fill_between(
         number,
         [np.quantile(ms, 0.05) for ms in times],
