@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any, TextIO
 import zenoh
 
 from potclient import cli as client_cli
+from potclient.datasets import FORMATS, FRAMES
 from potschemas import __version__
 from potserver.adapters.log import configure_logging, get_logger
 from potserver.config import Settings, as_tree, load_settings, to_toml
@@ -94,6 +95,20 @@ examples:
   potserver atoms build --recipe site.toml -o site.atoms      a recipe: see the README
   potserver atoms build --recipe site.toml -o site.atoms --ray auto
                                                               on a Ray cluster, with recordings at the same paths"""
+
+_EVAL = """\
+Measure maps on beams that they never saw: a fifth of each scan's beams is kept back, all scans go through the map scan
+by scan, and then it is asked about those beams' ends (occupied) and one point before each (free).
+
+Towns are asked about their exact truth too. Times are of maps that take turns, scan by scan, in this process.
+--peers needs `pip install 'potserver[peers]'` for OctoMap."""
+
+_EVAL_EXAMPLES = """\
+examples:
+  potserver eval /data/kitti/00 --scans 20 --max-range 25
+  potserver eval /data/kitti/00 --scans 20 --max-range 25 --peers octomap:0.1,octomap:0.2,bgk:0.2,grid
+  potserver eval town:terraces:dynamic:7 --scans 25 --max-range 25 --ablations --json out/town.json
+  potserver eval town:suburb:7 --profile paper --set mapping.n_sectors=8"""
 
 
 _MAP_INFO = """\
@@ -312,6 +327,25 @@ def _map(options: argparse.Namespace) -> int:
     return map_command.run(options, settings, _say)
 
 
+def _eval(options: argparse.Namespace) -> int:
+    overrides: dict[str, Any] = {
+        key: value
+        for key, value in {
+            "mapping.profile": options.profile,
+            "dictionary": options.dictionary,
+            "threads": options.threads,
+        }.items()
+        if value is not None
+    }
+    overrides.update(_split(assignment, "=", "--set", "KEY=VALUE") for assignment in options.sets)
+    settings = load_settings(file=options.settings, environ=os.environ, overrides=overrides)
+    from potserver.evaluation import command  # this loads the numerics
+
+    configure_logging("warning", "console")
+    command.run(options, settings)
+    return EXIT_OK
+
+
 def _demo(arguments: list[str]) -> int:
     try:
         demo = importlib.import_module("potserver.demo")
@@ -450,6 +484,16 @@ def _parser() -> argparse.ArgumentParser:
     _add_map_commands(maps.add_subparsers(title="commands", metavar="COMMAND", required=True))
     maps.set_defaults(run=_map)
 
+    evaluate = commands.add_parser(
+        "eval",
+        help="measure maps on held-out beams, beside other kinds of maps",
+        description=_EVAL,
+        epilog=_EVAL_EXAMPLES,
+        formatter_class=_Formatter,
+    )
+    _add_eval_flags(evaluate)
+    evaluate.set_defaults(run=_eval)
+
     commands.add_parser(
         "demo", help="map recorded scans through a real server, and score the maps", add_help=False
     )
@@ -552,6 +596,66 @@ def _add_build_flags(parser: argparse.ArgumentParser) -> None:
         metavar="KEY=VALUE",
         help="a setting of the learner; repeatable",
     )
+
+
+def _add_eval_flags(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "datasets", nargs="+", metavar="DATASET", help="recordings, as `potclient publish` takes them"
+    )
+    what = parser.add_argument_group("maps")
+    what.add_argument("--profile", metavar="NAME", help="mapping profile [default]")
+    what.add_argument(
+        "--ablations", action="store_true", help="rows for POT and RePOT with its priors as well"
+    )
+    what.add_argument(
+        "--peers",
+        type=lambda text: [name for name in text.split(",") if name],
+        default=[],
+        metavar="LIST",
+        help="other maps: octomap:METRES, bgk:METRES, bgk-gap:METRES, grid; with commas",
+    )
+    what.add_argument("--settings", metavar="FILE", help="TOML settings file (also POTSERVER_SETTINGS)")
+    what.add_argument("--dictionary", metavar="FILE", help="atom dictionary [the built-in atoms]")
+    what.add_argument(
+        "--threads", type=int, metavar="N", help="threads that integrate one scan [all processors]"
+    )
+    what.add_argument(
+        "--set",
+        action="append",
+        dest="sets",
+        default=[],
+        metavar="KEY=VALUE",
+        help="any setting, by its dotted name",
+    )
+    beams = parser.add_argument_group("beams")
+    beams.add_argument("--hold-out", type=float, default=0.2, metavar="SHARE", help="of the beams [0.2]")
+    beams.add_argument("--scans", metavar="N", help="the first N of each recording, or START:STOP:STEP [all]")
+    beams.add_argument(
+        "--thin", type=_positive_int, default=1, metavar="N", help="every Nth beam of a scan [1]"
+    )
+    beams.add_argument(
+        "--min-range", type=float, default=0.0, metavar="M", help="nearer beams are dropped [0]"
+    )
+    beams.add_argument(
+        "--max-range", type=float, metavar="M", help="longer beams are free up to here, without an echo"
+    )
+    beams.add_argument(
+        "--no-return", type=float, metavar="M", help="of CARMEN logs: readings from here on are no echoes"
+    )
+    beams.add_argument("--format", choices=FORMATS, default="auto", help="of the recordings [auto]")
+    beams.add_argument(
+        "--frame", choices=FRAMES, default="auto", help="of PCD files: where their points are [auto]"
+    )
+    out = parser.add_argument_group("results")
+    out.add_argument("--json", metavar="FILE", help="all numbers, with the machine and the options")
+    out.add_argument("--markdown", metavar="FILE", help="the tables, for a document")
+
+
+def _positive_int(text: str) -> int:
+    value = int(text)
+    if value < 1:
+        raise argparse.ArgumentTypeError(f"{value}: need at least 1")
+    return value
 
 
 def _add_settings_flags(parser: argparse.ArgumentParser) -> None:

@@ -53,6 +53,10 @@ class HoldOut:
         self.fraction, self.seed = fraction, seed
         self._next = 0
 
+    def beams(self, n: int, number: int) -> Bool:
+        """(n,) which of the n beams of scan `number` are held out."""
+        return self._rng(number).random(n) < self.fraction
+
     def split(self, scan: RecordedScan, number: int | None = None) -> tuple[RecordedScan, LabelledPoints]:
         """The scan without its held-out beams, and what those beams say.
 
@@ -62,10 +66,9 @@ class HoldOut:
         """
         number = self._next if number is None else number
         self._next = number + 1
-        rng = np.random.default_rng((self.seed, number))
         n = len(scan)
-        held = rng.random(n) < self.fraction
-        u = rng.random(n)
+        held = self.beams(n, number)
+        u = self._rng(number).random(2 * n)[n:]  # the numbers after those that chose the beams
         training = dataclasses.replace(scan, points=scan.points[~held], is_return=scan.is_return[~held])
         ends = scan.points[held].astype(np.float64)
         range_m = np.linalg.norm(ends, axis=1)
@@ -77,3 +80,6 @@ class HoldOut:
             points=local @ scan.T_map_sensor[:3, :3].T + scan.T_map_sensor[:3, 3],
             occupied=np.arange(len(local)) < len(hits),
         )
+
+    def _rng(self, number: int) -> np.random.Generator:
+        return np.random.default_rng((self.seed, number))

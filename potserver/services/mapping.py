@@ -146,7 +146,7 @@ class MappingService:
             reports = [_report(s, m, t) for s, m, t in zip(sectors, matches, transported, strict=True)]
             if not self.settings.refine:
                 return _FromAtoms(reports, carried, Refined(carried, True))
-            prior = carried.replace(weight_var=carried.weight_var + np.float32(self.settings.borrowed_var))
+            prior = self._prior_of(carried)
             with clock("refine"):
                 refined = self._refine(prior, in_map, _INSTANT_VOXEL * tiled.grid.fine_m)
             return _FromAtoms(reports, prior, refined)
@@ -361,6 +361,14 @@ class MappingService:
             return None if match is None else transport(match, sectors[i], self.settings, seed=self._seed + i)
 
         return parallel_map(run, range(len(sectors)), self._threads_each)
+
+    def _prior_of(self, carried: KernelSet) -> KernelSet:
+        """Transported kernels with what their weights are worth before this scan's labels."""
+        s = self.settings
+        if s.borrow_weights:
+            return carried.replace(weight_var=carried.weight_var + np.float32(s.borrowed_var))
+        zeros = np.zeros(len(carried), np.float32)
+        return carried.replace(weight_mean=zeros, weight_var=zeros + np.float32(s.prior_var))
 
     def _refine(self, kernels: KernelSet, labelled: LabelledPoints, voxel_m: float) -> Refined:
         """The instantaneous map: transported weights as prior, the scan's points as data, those of one voxel as one."""

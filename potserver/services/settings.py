@@ -71,6 +71,9 @@ class MappingSettings:
     borrowed_var: float = (
         25.0  # log-odds^2, added to the variance of transported weights: borrowed is not seen
     )
+    borrow_weights: bool = (
+        True  # transported weights are the prior of refinement; false: positions and widths alone, prior 0
+    )
     feature_cut: float = 0.02  # activations below this are left out of the solves
     instant_newton_steps: int = 4  # of the instantaneous map's solve
     instant_gradient_steps: int = 8  # conjugate-gradient steps for each of them

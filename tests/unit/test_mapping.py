@@ -344,6 +344,17 @@ def test_far_and_near_beams_are_cut_as_the_settings_say() -> None:
     assert sum(s.n_hits for s in update.sectors) == 1
 
 
+def test_transported_weights_can_be_left_out_of_the_prior() -> None:
+    """With a prior too narrow for the labels to move it, the weights are the prior's: transported ones, or zero."""
+    scan = _room_scan()
+    without = _service(borrow_weights=False, prior_var=1e-6).integrate(scan).kernels
+    borrowed = _service(borrow_weights=True).integrate(scan).kernels
+    assert len(without) == len(borrowed) > 0
+    np.testing.assert_array_equal(without.hinge_mean, borrowed.hinge_mean)
+    assert np.abs(without.weight_mean).max() < 0.01
+    assert np.abs(borrowed.weight_mean).max() > 1.0
+
+
 def test_standing_still_does_not_grow_the_default_map() -> None:
     service = _service()
     sizes = [service.integrate(_room_scan(seed=k)).map_kernels for k in range(6)]

@@ -128,6 +128,7 @@ def test_a_mistake_is_one_line_and_exit_code_two(
         ["atoms", "build"],
         ["atoms", "export"],
         ["atoms", "import"],
+        ["eval"],
     ],
 )
 def test_help_is_there_at_every_level(capsys: pytest.CaptureFixture[str], words: list[str]) -> None:

@@ -1,0 +1,209 @@
+"""How long do ghosts live: what maps say of places that a car has left, against how often later scans saw through them.
+
+    python benchmarks/ghosts.py [DATASET] [--scans 0:240:2] [--json FILE] [-o docs/ghosts.png]
+
+In a dynamic town, end points of beams on cars and people are followed. Once the solids have gone from there, and nothing else
+is near, the maps are asked after every scan how likely the place still is occupied. A scan sees through a place if one of
+its beams passes nearer than 0.15 m to it and ends at least 0.3 m beyond, or does not end.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.progress import track
+from rich.table import Table
+from scipy.spatial import cKDTree
+
+from potclient.datasets import RecordedScan, open_dataset
+from potclient.towns import Town, TownRecording
+from potclient.towns.solids import SolidSet
+from potserver import AtomDictionary, MappingSettings
+from potserver.evaluation.mappers import Mapper, ServiceMap
+from potserver.evaluation.peers import peer_named
+
+_INSIDE_M = 0.1  # along the beam: an end point moved so far is inside what it met
+_CLEAR_M = 0.4  # around a ghost nothing else may be
+_PASSES_M, _BEYOND_M = 0.15, 0.3
+_STOOD = 5  # scans that found a place occupied: from there on its car stood
+_A_SCAN = 200  # places that are followed from each scan on, at most
+_MOST = 20  # scans that saw through
+_SHOWN = (0, 1, 2, 3, 5, 8, 12, 16, 20)
+
+
+@dataclasses.dataclass
+class Places:
+    """End points of beams on what moves."""
+
+    points: np.ndarray  # (N, 3) m
+    inside: np.ndarray  # (N, 3) m
+    n_occupied: np.ndarray  # (N,) scans at whose time it was
+    left: np.ndarray  # (N,) bool
+    n_through: np.ndarray  # (N,) scans since then that saw through
+
+    @classmethod
+    def none(cls) -> Places:
+        nothing = np.zeros((0, 3))
+        return cls(nothing, nothing, np.zeros(0, int), np.zeros(0, bool), np.zeros(0, int))
+
+    def take(self, chosen: np.ndarray) -> Places:
+        return Places(*(getattr(self, field.name)[chosen] for field in dataclasses.fields(self)))
+
+    def add(self, points: np.ndarray, inside: np.ndarray) -> Places:
+        n = len(points)
+        more = (points, inside, np.zeros(n, int), np.zeros(n, bool), np.zeros(n, int))
+        return Places(
+            *(
+                np.concatenate([getattr(self, f.name), m])
+                for f, m in zip(dataclasses.fields(self), more, strict=True)
+            )
+        )
+
+
+def main() -> int:
+    options = _options()
+    console = Console(width=120)
+    recording = open_dataset(options.dataset, max_range_m=options.max_range)
+    if not isinstance(recording, TownRecording) or not recording.town.dynamic:
+        raise SystemExit(f"{options.dataset}: need a dynamic town, such as town:terraces:dynamic:7")
+    first, last, step = (int(n) for n in options.scans.split(":"))
+    maps = _maps(options)
+    sums = {kind: {m.name: np.zeros((_MOST + 1, 2)) for m in maps} for kind in ("passed by", "stood there")}
+    places, rng = Places.none(), np.random.default_rng(0)
+    for number in track(range(first, last, step), description="scans", console=Console(stderr=True)):
+        scan = recording[number]
+        for a_map in maps:
+            a_map.integrate(scan)
+        places = _followed(places, recording.town, scan)
+        _count(sums, maps, places)
+        places = places.add(*_on_movers(recording.town, scan, rng))
+    console.print(f"{options.dataset}, scans {options.scans}, to {options.max_range:g} m")
+    report = {
+        kind: {name: (s[:, 0] / np.maximum(s[:, 1], 1)).tolist() for name, s in of.items()}
+        for kind, of in sums.items()
+    }
+    report["places"] = {kind: next(iter(of.values()))[:, 1].astype(int).tolist() for kind, of in sums.items()}
+    console.print(_table(report, [m.name for m in maps]))
+    if options.json:
+        Path(options.json).write_text(json.dumps(report, indent=1))
+    if options.out:
+        _draw(report, [m.name for m in maps], options.out)
+        console.print(f"curves: {options.out}")
+    return 0
+
+
+def _options() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("dataset", nargs="?", default="town:terraces:dynamic:vlp16:7")
+    parser.add_argument("--scans", default="0:240:2", metavar="START:STOP:STEP")
+    parser.add_argument("--max-range", type=float, default=25.0, metavar="M")
+    parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--json", metavar="FILE", help="write the numbers")
+    parser.add_argument("-o", "--out", metavar="PNG")
+    return parser.parse_args()
+
+
+def _maps(options: argparse.Namespace) -> list[Mapper]:
+    atoms, settings = AtomDictionary.builtin(), MappingSettings()
+    never = dataclasses.replace(settings, fade_rate=0.0)
+    maps: list[Mapper] = [
+        ServiceMap("ours", settings, atoms, threads=options.threads),
+        ServiceMap("ours, fade_rate 0", never, atoms, threads=options.threads),
+        peer_named("octomap:0.2", threads=options.threads),
+    ]
+    for a_map in maps:
+        a_map.warm_up(planar=False)
+    return maps
+
+
+def _on_movers(town: Town, scan: RecordedScan, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """End points on what moves, and points inside it behind them."""
+    origin = scan.T_map_sensor[:3, 3]
+    ends = scan.in_map[scan.is_return]
+    ends = ends[rng.permutation(len(ends))]
+    beams = ends - origin
+    inside = ends + _INSIDE_M * beams / np.linalg.norm(beams, axis=1, keepdims=True)
+    lower, upper = ends[:, :2].min(axis=0), ends[:, :2].max(axis=0)
+    moving = SolidSet(town.moving(scan.stamp_ns / 1e9, lower, upper))
+    chosen = np.flatnonzero(moving.contains(inside))[:_A_SCAN]
+    return ends[chosen], inside[chosen]
+
+
+def _followed(places: Places, town: Town, scan: RecordedScan) -> Places:
+    """The places after one more scan: which have been left, how often they were seen through. Those taken again drop out."""
+    if not len(places.points):
+        return places
+    time_s = scan.stamp_ns / 1e9
+    occupied = town.occupied(places.inside, time_s)
+    around = np.concatenate([np.eye(3), -np.eye(3), np.zeros((1, 3))]) * _CLEAR_M
+    clear = ~np.any([town.occupied(places.points + offset, time_s) for offset in around], axis=0)
+    places.n_occupied += occupied & ~places.left
+    gone = ~occupied & clear
+    places.n_through += gone & _seen_through(places.points, scan)
+    keep = gone | (~places.left & occupied)  # left and clear, or still there
+    places.left |= gone
+    return places.take(keep & (places.n_through <= _MOST))
+
+
+def _seen_through(points: np.ndarray, scan: RecordedScan) -> np.ndarray:
+    origin = scan.T_map_sensor[:3, 3]
+    beams, ways = scan.in_map - origin, points - origin
+    length, distance = np.linalg.norm(beams, axis=1), np.linalg.norm(ways, axis=1)
+    apart, nearest = cKDTree(beams / length[:, None]).query(ways / distance[:, None])
+    return (apart * distance < _PASSES_M) & (length[nearest] > distance + _BEYOND_M)
+
+
+def _count(sums: dict[str, dict[str, np.ndarray]], maps: list[Mapper], places: Places) -> None:
+    chosen = places.take(places.left)
+    stood = chosen.n_occupied >= _STOOD
+    for a_map in maps:
+        p, known = a_map.occupancy(chosen.points)
+        p = np.where(known, p, 0.5)
+        for kind, members in (("passed by", ~stood), ("stood there", stood)):
+            np.add.at(sums[kind][a_map.name][:, 0], chosen.n_through[members], p[members])
+            np.add.at(sums[kind][a_map.name][:, 1], chosen.n_through[members], 1)
+
+
+def _table(report: dict[str, Any], names: list[str]) -> Table:
+    table = Table(
+        box=None, pad_edge=False, header_style="dim", title="mean P(occupied) where something has left"
+    )
+    table.add_column("scans that saw through", no_wrap=True)
+    for count in _SHOWN:
+        table.add_column(str(count), justify="right")
+    for kind in ("passed by", "stood there"):
+        for name in names:
+            table.add_row(f"{kind}: {name}", *(f"{report[kind][name][c]:.2f}" for c in _SHOWN))
+        table.add_row(f"{kind}: places", *(f"{report['places'][kind][c]:,}" for c in _SHOWN))
+    return table
+
+
+def _draw(report: dict[str, Any], names: list[str], path: str) -> None:
+    import matplotlib.pyplot as plt
+
+    figure, axes = plt.subplots(1, 2, figsize=(9.0, 3.4), sharey=True, layout="constrained")
+    for axis, kind in zip(axes, ("passed by", "stood there"), strict=True):
+        enough = np.array(report["places"][kind]) >= 30
+        count = np.arange(_MOST + 1)
+        for name in names:
+            axis.plot(count[enough], np.array(report[kind][name])[enough], "o-", ms=3, label=name)
+        axis.set_title(f"a car or person that {kind}")
+        axis.set_xlabel("scans since then that saw through")
+        axis.set_ylim(0, 1)
+        axis.grid(alpha=0.3)
+    axes[0].set_ylabel("mean P(occupied)")
+    axes[0].legend(frameon=False)
+    figure.savefig(path, dpi=110)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

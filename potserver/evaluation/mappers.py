@@ -1,0 +1,103 @@
+"""What is evaluated: anything that takes scans one after the other and says how likely points are occupied."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import NamedTuple
+
+import numpy as np
+
+from potclient.datasets import RecordedScan
+from potclient.results import Bool, Float64
+from potserver.atom_builder.scan_task import to_scan
+from potserver.domain.dictionary import AtomDictionary
+from potserver.domain.kernel_map import KernelMap
+from potserver.domain.types import KernelSet
+from potserver.services.mapping import MappingService
+from potserver.services.settings import MappingSettings
+
+_NUMBERS_A_KERNEL = 10  # position, its variances, gamma's shape and rate, the weight and its variance
+
+
+class Size(NamedTuple):
+    """How large a map is."""
+
+    cells: int  # kernels, or voxels of known state
+    n_bytes: int  # of what a reader needs to give the same answers
+    n_bytes_binary: int | None = None  # of a file that tells only occupied from free
+
+
+class Mapper(ABC):
+    """One row of the table."""
+
+    name: str
+    is_batch = False  # fitted once, after the last scan
+
+    def warm_up(self, *, planar: bool) -> None:  # noqa: B027 - most have nothing to compile
+        """Compile what is compiled, so that no scan pays for it."""
+
+    @abstractmethod
+    def integrate(self, scan: RecordedScan) -> dict[str, float]:
+        """Add a scan; ms by stage, where the mapper tells stages apart."""
+
+    def finish(self, n_kernels: int) -> None:  # noqa: B027 - only batch mappers have work left
+        """All scans have come.
+
+        Args:
+            n_kernels: Of the first map of the table, for those that are given as many.
+        """
+
+    @abstractmethod
+    def occupancy(self, points: Float64) -> tuple[Float64, Bool]:
+        """(N,) P(occupied) and (N,) whether the map knows, at (N, 3) points, m, map frame."""
+
+    @abstractmethod
+    def size(self) -> Size:
+        """How large the map is now."""
+
+    @property
+    def kernel_map(self) -> KernelMap | None:
+        """The map as kernels, if it is one: then rays can be asked."""
+        return None
+
+
+class ServiceMap(Mapper):
+    """Our map, through the service that the server runs.
+
+    Args:
+        name: Of the row.
+        settings: Of the pipeline.
+        dictionary: The atoms.
+        threads: Threads that integrating one scan may use.
+    """
+
+    def __init__(
+        self, name: str, settings: MappingSettings, dictionary: AtomDictionary, *, threads: int
+    ) -> None:
+        self.name = name
+        self._service = MappingService(dictionary, settings, threads=threads)
+        self._n_scans = 0
+
+    def warm_up(self, *, planar: bool) -> None:
+        self._service.warm_up()
+
+    def integrate(self, scan: RecordedScan) -> dict[str, float]:
+        update = self._service.integrate(to_scan(scan, self._n_scans))
+        self._n_scans += 1
+        return update.timings_ms
+
+    def occupancy(self, points: Float64) -> tuple[Float64, Bool]:
+        answer = self.kernel_map.occupancy(points)
+        return answer.mean, answer.observed
+
+    def size(self) -> Size:
+        return Size(len(self.kernel_map), kernel_bytes(self.kernel_map.kernels))
+
+    @property
+    def kernel_map(self) -> KernelMap:
+        return self._service.snapshot
+
+
+def kernel_bytes(kernels: KernelSet) -> int:
+    """Bytes that kernels take on the way to a reader: all their numbers in single precision."""
+    return len(kernels) * _NUMBERS_A_KERNEL * np.dtype(np.float32).itemsize
