@@ -142,11 +142,14 @@ class MappingService:
                 matches = self._atoms.matchers[2 if scan.is_planar else 3].match(sectors)
             with clock("transport"):
                 transported = self._transport(matches, sectors)
-            carried = KernelSet.concatenate([t.kernels for t in transported if t is not None])
             reports = [_report(s, m, t) for s, m, t in zip(sectors, matches, transported, strict=True)]
+            served = [
+                (m, t) for m, t in zip(matches, transported, strict=True) if m is not None and t is not None
+            ]
             if not self.settings.refine:
+                carried = KernelSet.concatenate([t.kernels for _, t in served])
                 return _FromAtoms(reports, carried, Refined(carried, True))
-            prior = self._prior_of(carried)
+            prior = KernelSet.concatenate([self._prior_of(t.kernels, m.w2_m2) for m, t in served])
             with clock("refine"):
                 refined = self._refine(prior, in_map, _INSTANT_VOXEL * tiled.grid.fine_m)
             return _FromAtoms(reports, prior, refined)
@@ -183,7 +186,7 @@ class MappingService:
             map_revision=moment.revision,
             kernels=instantaneous.refined.kernels,
             sectors=instantaneous.sectors,
-            n_points=len(beams.ends),
+            n_points=len(beams.ends) + len(checked.ends),
             n_kernels_added=fused.n_added,
             n_kernels_transported=fused.n_transported,
             map_kernels=len(snapshot),
@@ -362,11 +365,12 @@ class MappingService:
 
         return parallel_map(run, range(len(sectors)), self._threads_each)
 
-    def _prior_of(self, carried: KernelSet) -> KernelSet:
-        """Transported kernels with what their weights are worth before this scan's labels."""
+    def _prior_of(self, carried: KernelSet, w2_m2: float) -> KernelSet:
+        """Kernels carried over such a distance, with what their weights are worth before this scan's labels."""
         s = self.settings
         if s.borrow_weights:
-            return carried.replace(weight_var=carried.weight_var + np.float32(s.borrowed_var))
+            borrowed = np.float32(s.borrowed_var_per_m2 * max(w2_m2, 0.0))  # the entropy may make it negative
+            return carried.replace(weight_var=carried.weight_var + borrowed)
         zeros = np.zeros(len(carried), np.float32)
         return carried.replace(weight_mean=zeros, weight_var=zeros + np.float32(s.prior_var))
 

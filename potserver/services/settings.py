@@ -68,9 +68,10 @@ class MappingSettings:
     # refinement (RePOT)
     refine: bool = True
     prior_var: float = 50.0  # log-odds^2, of kernels without a transported prior
-    borrowed_var: float = (
-        25.0  # log-odds^2, added to the variance of transported weights: borrowed is not seen
+    borrowed_var_per_m2: float = (
+        10.0  # log-odds^2 for each m^2 of squared distance between atom and sector, added to the
     )
+    # variance of transported weights: borrowed is not seen, and the less the farther it was carried
     borrow_weights: bool = (
         True  # transported weights are the prior of refinement; false: positions and widths alone, prior 0
     )
@@ -112,7 +113,7 @@ class MappingSettings:
             "fade_rate",
             "half_life_s",
             "check_share",
-            "borrowed_var",
+            "borrowed_var_per_m2",
             "residual_var",
             "mean_moderation",
             "rank_voxel_m",
