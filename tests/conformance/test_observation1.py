@@ -53,7 +53,7 @@ def test_row_c12_weights_are_high_where_there_are_hits(name: str) -> None:
 
 @town
 def test_row_c12_gammas_are_high_at_edges(name: str) -> None:
-    """Measured: 0.61 on the street (0.64 with 60 steps an epoch), 0.81 in rooms; 0.5 for the start, and if gammas are shuffled."""
+    """Measured: 0.61 on the street (0.64 with 60 steps an epoch), 0.81 in rooms; 0.5 for the start and if shuffled."""
     sectors = learned_town(name)
     gammas = [sector.atom.kernels.gamma.astype(np.float64) for sector in sectors]
     learned, by_chance = _near_above_far(sectors, gammas), _near_above_far(sectors, _shuffled(gammas))

@@ -130,8 +130,9 @@ def _transfer_auc(name: str, seed: int | None) -> Float64:
 def test_row_c13_kernels_of_like_sectors_predict_best() -> None:
     """Kernels of one sector, laid on another, tell its hits from its free points the better, the nearer the two are in shape.
 
-    Measured, Spearman of distance and AUC over 132 ordered pairs a town: -0.40 on the street, -0.27 in rooms; +0.16 with the weights shuffled inside each sector. AUC by the kernels of the nearest
-    other sector: 0.79 and 0.66; by those of any other: 0.74 and 0.58.
+    Measured, Spearman of distance and AUC over 132 ordered pairs a town: -0.40 on the street, -0.27 in rooms; +0.16 with the
+    weights shuffled inside each sector. AUC by the kernels of the nearest other sector: 0.79 and 0.66; by those of any other:
+    0.74 and 0.58.
     """
     learned, shuffled, nearest, others = [], [], [], []
     for name in TOWNS:
