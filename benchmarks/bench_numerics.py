@@ -13,10 +13,10 @@ import pytest
 
 from potserver.domain.kernel_map import KernelMap
 from potserver.numerics.coupling import Ragged, couple, coupling_costs
+from potserver.numerics.feature_blocks import feature_blocks
 from potserver.numerics.geometry import rotation_z
-from potserver.numerics.kernel_index import sparse_features
-from potserver.numerics.logistic import fit_sparse
 from potserver.numerics.threads import default_threads
+from potserver.numerics.warm_fit import warm_fit
 
 THREADS = (1, default_threads())
 
@@ -123,10 +123,12 @@ def test_refinement(benchmark: Any, threads: int) -> None:
     gamma = np.full(len(hinge), 1.4)
 
     def solve() -> Any:
-        features = sparse_features(points, hinge, gamma, cut=0.02, threads=threads)
+        blocks = feature_blocks(points, hinge, gamma, edge_m=1.0, cut=0.02, bytes_a_value=1, threads=threads)
         zeros, prior = np.zeros(len(hinge), np.float32), np.full(len(hinge), 50.0, np.float32)
-        return fit_sparse(features, labels, zeros, prior, tolerance=0.03, threads=threads)
+        counts = np.ones(len(points), np.float32)
+        return warm_fit(
+            blocks, labels, counts, zeros, prior, zeros, n_newton=4, n_conjugate_gradient=8, threads=threads
+        )
 
-    posterior = benchmark(solve)
-    assert posterior.converged
+    assert benchmark(solve).converged
     benchmark.extra_info.update(points=len(points), kernels=len(hinge), threads=threads)

@@ -27,8 +27,8 @@ from potclient.holdout import HoldOut, LabelledPoints
 from potclient.metrics import Metrics, score
 from potserver.atom_builder.scan_task import SectorOf, to_scan
 from potserver.domain.kernel_map import KernelMap
-from potserver.numerics.kernel_index import sparse_features
-from potserver.numerics.logistic import fit_sparse
+from potserver.numerics.feature_blocks import feature_blocks
+from potserver.numerics.warm_fit import warm_fit
 from potserver.services.learning import LearningSettings, beam_weights, cut_sectors, lattice, learn_kernels
 
 _GRID_LENGTH = 0.75  # spacings
@@ -160,14 +160,19 @@ def _grid(sector: Sector, count: int, settings: LearningSettings) -> tuple[Score
         points, occupied = points[drawn], occupied[drawn]
     hinge, started = lattice(points, count)
     gamma = started / _GRID_LENGTH**2
-    features = sparse_features(points, hinge, gamma, cut=1e-3)
+    corner = points.min(axis=0)
+    blocks = feature_blocks(
+        points - corner, hinge - corner, gamma, edge_m=float(1.0 / np.sqrt(2.0 * gamma[0])), cut=1e-3
+    )
+    zeros = np.zeros(len(hinge), np.float32)
     results = {}
     for prior_var in {settings.weight_var, *_FAVOURED_PRIORS}:
-        solved = fit_sparse(
-            features, occupied, np.zeros(len(hinge), np.float32), np.full(len(hinge), prior_var, np.float32),
-            sample_weight=beam_weights(occupied, settings.free_per_beam), max_newton=30, max_conjugate_gradient=200,
+        solved = warm_fit(
+            blocks, occupied, beam_weights(occupied, settings.free_per_beam), zeros,
+            np.full(len(hinge), prior_var, np.float32), zeros,
+            n_newton=50, n_conjugate_gradient=200, least_curvature=1e-5,
         )  # fmt: skip
-        results[prior_var] = _scored(sector, hinge, gamma, solved.mean)
+        results[prior_var] = _scored(sector, hinge, gamma, solved.weights)
     return results[settings.weight_var], min(results.values(), key=lambda scores: scores.own.nll)
 
 

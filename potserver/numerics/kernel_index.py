@@ -269,56 +269,6 @@ def group_points(points: Float64, scale_m: float) -> tuple[Int64, Int64]:
         edge *= 1.8
 
 
-class SparseFeatures(NamedTuple):
-    """Rows of phi in compressed sparse rows, for the points in `order`."""
-
-    order: Int64  # (N,) row r belongs to points[order[r]]
-    indptr: Int64  # (N + 1,)
-    indices: NDArray[np.int32]  # (nnz,) kernel numbers as given
-    values: Float32  # (nnz,) phi
-
-
-def sparse_features(
-    points: Float64, hinge: Float64, gamma: Floats, *, cut: float, threads: int = 1
-) -> SparseFeatures:
-    """phi of every kernel at every point, where it is at least `cut`.
-
-    Args:
-        points: (N, 3) float64, m.
-        hinge: (K, 3) float64, m, same frame.
-        gamma: (K,) 1/m^2.
-        cut: Smallest phi that is kept, in (0, 1).
-    """
-    ones = np.ones(len(hinge))
-    index = build_index(
-        hinge, gamma, ones, np.zeros(len(hinge)), activation_cut=cut, tau=cut, guard_stacks=False
-    )
-    if len(points) == 0 or len(hinge) == 0:
-        return SparseFeatures(
-            np.arange(len(points)),
-            np.zeros(len(points) + 1, np.int64),
-            np.zeros(0, np.int32),
-            np.zeros(0, np.float32),
-        )
-    order, cuts = group_points(points, index.median_reach_m)
-    grouped = points[order]
-
-    def run(span: tuple[int, int]) -> tuple[Int64, NDArray[np.int32], Float32]:
-        return _feature_rows(
-            grouped, cuts[span[0] : span[1] + 1], index.hinge, index.columns, index.order, index.level_start,
-            index.level_edge, index.level_cell, index.level_size, index.keys, np.float32(cut),
-        )  # fmt: skip
-
-    parts = parallel_map(run, spans(len(cuts) - 1, 4 * threads if threads > 1 else 1), threads)
-    counts = np.concatenate([p[0] for p in parts])
-    return SparseFeatures(
-        order,
-        np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
-        np.concatenate([p[1] for p in parts]),
-        np.concatenate([p[2] for p in parts]),
-    )
-
-
 @nb.njit(nogil=True, error_model="numpy", cache=True)
 def _cut_sums(points, hinge, gamma, weight, variance, taus):
     """Float64: for each sample and each tau, the sums that a cut at tau leaves out; and the whole variance."""
@@ -462,45 +412,3 @@ def _sum_cubes(points, cuts, hinge, columns, level_start, level_edge, level_cell
                 np.float32(points[q, 0] - cx), np.float32(points[q, 1] - cy), np.float32(points[q, 2] - cz),
                 local[0], local[1], local[2], local[3], local[4], local[5], n,
             )  # fmt: skip
-
-
-@nb.njit(nogil=True, error_model="numpy", cache=True)
-def _feature_rows(
-    points, cuts, hinge, columns, order, level_start, level_edge, level_cell, level_size, keys, cut
-):
-    first, last = cuts[0], cuts[-1]
-    counts = np.zeros(last - first, np.int64)
-    capacity = 32 * (last - first) + 1024
-    indices = np.empty(capacity, np.int32)
-    values = np.empty(capacity, np.float32)
-    found = np.empty(4096, np.int64)
-    lower = np.empty(3)
-    upper = np.empty(3)
-    total = 0
-    for cube in range(len(cuts) - 1):
-        a, b = cuts[cube], cuts[cube + 1]
-        _box(points, a, b, lower, upper)
-        n, found = _gather(
-            lower, upper, hinge, columns, level_start, level_edge, level_cell, level_size, keys, found
-        )
-        for q in range(a, b):
-            if total + n > capacity:
-                capacity = 2 * (total + n)
-                grown_indices = np.empty(capacity, np.int32)
-                grown_values = np.empty(capacity, np.float32)
-                grown_indices[:total] = indices[:total]
-                grown_values[:total] = values[:total]
-                indices, values = grown_indices, grown_values
-            row = total
-            for i in range(n):
-                m = found[i]
-                dx = np.float32(points[q, 0] - hinge[m, 0])
-                dy = np.float32(points[q, 1] - hinge[m, 1])
-                dz = np.float32(points[q, 2] - hinge[m, 2])
-                phi = exp32(columns[0, m] * (dx * dx + dy * dy + dz * dz))
-                if phi >= cut:
-                    indices[total] = order[m]
-                    values[total] = phi
-                    total += 1
-            counts[q - first] = total - row
-    return counts, indices[:total].copy(), values[:total].copy()

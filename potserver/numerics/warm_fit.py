@@ -2,11 +2,11 @@
 
     minimise  sum_n c_n (log(1 + exp(f_n)) - y_n f_n) + 1/2 sum_m (w_m - prior_mean_m)^2 / prior_var_m,    f = Phi w
 
-Unlike `logistic.fit_sparse` it does a fixed amount of work and is never far from the last optimum, but for where the world has
-changed. There plain Newton gets stuck: a row that is surely wrong has no curvature left, steps overshoot and every line search
-fails. Rows on the wrong side take the curvature of the quadratic bound of Jaakkola and Jordan (1997), with which no
-step overshoots, and every row has a least curvature: the higher, the more cautious the steps, and the farther from the optimum
-they end. Without a floor to speak of and with more steps this is a solver like any other, the fastest one here.
+It does a bounded amount of work and is never far from the last optimum, but for where the world has changed. There plain Newton
+gets stuck: a row that is surely wrong has no curvature left, steps overshoot and every line search fails. Rows on the wrong
+side take the curvature of the quadratic bound of Jaakkola and Jordan (1997), with which no step overshoots, and every row has a
+least curvature: the higher, the more cautious the steps, and the farther from the optimum they end. Without a floor to speak
+of and with more steps this is a solver like any other.
 """
 
 from __future__ import annotations

@@ -12,7 +12,6 @@ from potserver.numerics.kernel_index import (
     group_points,
     latent_sums,
     reach,
-    sparse_features,
     stack_sizes,
 )
 
@@ -104,30 +103,6 @@ def test_groups_hold_every_point_once_and_stay_small(n: int, spread: float) -> N
     assert (np.diff(cuts) > 0).all()
     widest = max(np.ptp(points[order[a:b]], axis=0).max() for a, b in itertools.pairwise(cuts))
     assert widest <= max(2.0 * 1.5 * 1.8, 10 * spread / 2**20)
-
-
-@pytest.mark.parametrize("cut", [0.5, 0.01, 1e-6])
-@pytest.mark.parametrize("threads", [1, 3])
-def test_sparse_features_are_the_dense_ones_above_the_cut(cut: float, threads: int) -> None:
-    points, hinge, gamma, _, _ = _case()
-    features = sparse_features(points, hinge, gamma, cut=cut, threads=threads)
-    dense = np.zeros((len(points), len(hinge)))
-    for row, point in enumerate(features.order):
-        entries = slice(features.indptr[row], features.indptr[row + 1])
-        assert len(np.unique(features.indices[entries])) == entries.stop - entries.start
-        dense[point, features.indices[entries]] = features.values[entries]
-    truth = _phi(points, hinge, gamma)
-    np.testing.assert_allclose(dense, np.where(truth >= cut, truth, 0.0), atol=1e-5 if cut > 1e-3 else 2e-6)
-    assert (features.values >= np.float32(cut)).all()
-    np.testing.assert_array_equal(np.sort(features.order), np.arange(len(points)))
-
-
-def test_sparse_features_of_nothing() -> None:
-    points, hinge, gamma, _, _ = _case()
-    for p, h, g in ((points[:0], hinge, gamma), (points, hinge[:0], gamma[:0])):
-        features = sparse_features(p, h, g, cut=0.01)
-        assert len(features.values) == 0
-        assert len(features.indptr) == len(p) + 1
 
 
 def test_the_index_is_a_function_of_its_input() -> None:
