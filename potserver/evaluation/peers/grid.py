@@ -11,9 +11,9 @@ from potclient.results import Bool, Float64
 from potserver.domain.kernel_map import KernelMap
 from potserver.domain.types import KernelSet
 from potserver.evaluation.mappers import Mapper, Size, kernel_bytes
-from potserver.numerics.kernel_index import sparse_features
+from potserver.numerics.feature_blocks import feature_blocks
 from potserver.numerics.lattice_nodes import new_nodes
-from potserver.numerics.logistic import fit_sparse
+from potserver.numerics.warm_fit import warm_fit
 from potserver.services.refinement import kernels_at
 
 _SAMPLES = 200_000  # of all scans together: what a batch solve can hold
@@ -22,6 +22,8 @@ _GAP_M = 0.3
 _COARSE_PER_FINE = 2.5
 _PRIOR_VAR = 50.0  # log-odds^2
 _CUT = 0.01  # activations below this are left out of the solve
+_NEWTON_STEPS, _GRADIENT_STEPS = 12, 60  # at most: Newton's, and conjugate gradients for each
+_LEAST_CURVATURE = 1e-5  # next to none: a solve to the end
 _FINEST_M, _COARSEST_M, _HALVINGS = 0.02, 10.0, 14
 
 
@@ -63,14 +65,20 @@ class GridMap(Mapper):
 
     def finish(self, n_kernels: int) -> None:
         kernels = self._lattices(n_kernels)
-        features = sparse_features(
-            self._points, kernels.hinge_mean, kernels.gamma, cut=_CUT, threads=self._threads
-        )
-        solved = fit_sparse(
-            features, self._occupied, kernels.weight_mean, kernels.weight_var, threads=self._threads
-        )
+        corner = self._points.min(axis=0)
+        width_m = float(np.median(1.0 / np.sqrt(2.0 * kernels.gamma)))
+        blocks = feature_blocks(
+            self._points - corner, kernels.hinge_mean - corner, kernels.gamma, edge_m=width_m, cut=_CUT,
+            threads=self._threads,
+        )  # fmt: skip
+        counts = np.ones(len(self._points), np.float32)
+        solved = warm_fit(
+            blocks, self._occupied, counts, kernels.weight_mean, kernels.weight_var, kernels.weight_mean,
+            n_newton=_NEWTON_STEPS, n_conjugate_gradient=_GRADIENT_STEPS, least_curvature=_LEAST_CURVATURE,
+            threads=self._threads,
+        )  # fmt: skip
         self._map = KernelMap(
-            kernels.replace(weight_mean=solved.mean, weight_var=solved.var),
+            kernels.replace(weight_mean=solved.weights, weight_var=solved.var),
             mean_moderation=0.0,  # the mode's own probability, as the published figures of such maps
             threads=self._threads,
         )
