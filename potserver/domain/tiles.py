@@ -248,6 +248,14 @@ class Region:
         """(3,) m, map frame."""
         return np.asarray(self.lower, np.float64) * self.grid.size_m
 
+    def crowded(self, points: Float64, share: float) -> Bool:
+        """(N,) which points, (N, 3) m in this frame, lie in tiles with at least so many rows a voxel of free space."""
+        size = np.asarray(self.upper, np.int64) - np.asarray(self.lower, np.int64) + 1
+        row_tile = np.clip(self.rows.voxel // _tile_edge(self.rows, self.grid), 0, size - 1)
+        counts = np.bincount(_numbers(row_tile, size), minlength=int(size.prod()))
+        tile = np.clip(np.floor(points / self.grid.size_m), 0, size - 1).astype(np.int64)
+        return np.asarray(counts[_numbers(tile, size)] >= share * self.grid.voxels**3)
+
     def tiles(
         self, lower_m: Float64, upper_m: Float64, *, revision: int = 0, stamp_ns: int = 0
     ) -> dict[TileIndex, Tile]:
@@ -285,6 +293,11 @@ def _tile_edge(rows: Rows, grid: TileGrid) -> NDArray[np.int64]:
 
 def _by_tile(tile: NDArray[np.integer], size: NDArray[np.int64]) -> list[NDArray[np.intp]]:
     """For each tile of the box, the numbers of what lies in it, ascending."""
-    number = (tile[:, 0] * size[1] + tile[:, 1]) * size[2] + tile[:, 2]
+    number = _numbers(tile, size)
     counts = np.bincount(number, minlength=int(size.prod()))
     return np.split(np.argsort(number, kind="stable"), np.cumsum(counts)[:-1])
+
+
+def _numbers(tile: NDArray[np.integer], size: NDArray[np.int64]) -> NDArray[np.int64]:
+    """(N,) one number for each (N, 3) tile of a box."""
+    return np.asarray((tile[:, 0] * size[1] + tile[:, 1]) * size[2] + tile[:, 2], np.int64)

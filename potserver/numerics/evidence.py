@@ -72,6 +72,7 @@ def add(
     weight: Float64 | Float32,
     fine_m: float,
     source: int = 0,
+    crowded: Bool | None = None,
 ) -> Added:
     """Add a source's weighted samples to the rows; a negative weight takes samples off, down to nothing and no further.
 
@@ -82,6 +83,8 @@ def add(
         weight: (N,) of each sample.
         fine_m: The resolution.
         source: Who saw them; rows of others stay as they are.
+        crowded: (N,) where there are rows enough: a free sample in a new voxel there, with no hits at or beside it, counts
+            at the row of a voxel beside it, if there is one, and does not move that row's mean. Nowhere by default.
     """
     n_old, n = len(rows.occupied), len(points)
     voxel = np.empty((n_old + n, 3), np.int32)
@@ -93,7 +96,8 @@ def add(
     gained = np.zeros(n_old + n, np.float32)
     used = _add(
         voxel, label, sums, sources, gained, n_old, np.ascontiguousarray(points), occupied,
-        np.asarray(weight, np.float64), fine_m, source, empty_table(n_old + n),
+        np.asarray(weight, np.float64), fine_m, source, np.zeros(n, bool) if crowded is None else crowded,
+        empty_table(n_old + n), empty_table(n_old + n),
     )  # fmt: skip
     return Added(Rows(voxel[:used], label[:used], sums[:used], sources[:used]), gained[:used])
 
@@ -210,12 +214,32 @@ def decay(rows: Rows, factor: float) -> Rows:
 
 
 @nb.njit(nogil=True, error_model="numpy", cache=True)
-def _add(voxel, label, sums, sources, gained, n, points, occupied, weight, fine_m, source, table):
+def _add(
+    voxel,
+    label,
+    sums,
+    sources,
+    gained,
+    n,
+    points,
+    occupied,
+    weight,
+    fine_m,
+    source,
+    crowded,
+    table,
+    hit_table,
+):
     keys = np.empty(len(label), np.int64)
+    hit_cells = np.empty(len(label), np.int64)  # free voxels with hits in them, of any source
+    n_hit_cells = 0
+    some_crowded = crowded.any()
     for r in range(n):
         if sources[r] == source:
             keys[r] = pack(label[r], voxel[r, 0], voxel[r, 1], voxel[r, 2])
             table[find(table, keys, keys[r])] = r
+        if some_crowded and label[r]:
+            n_hit_cells = _enter_hit(hit_table, hit_cells, n_hit_cells, voxel[r])
     cell = np.empty(3, np.int64)
     for i in range(len(points)):
         edge = 0.5 * fine_m if occupied[i] else fine_m
@@ -223,10 +247,20 @@ def _add(voxel, label, sums, sources, gained, n, points, occupied, weight, fine_
             cell[c] = np.int64(np.floor(points[i, c] / edge))
         key = pack(occupied[i], cell[0], cell[1], cell[2])
         place = find(table, keys, key)
-        r = table[place]
+        r = np.int64(table[place])
+        w = weight[i]
+        if r < 0 and w <= 0.0:
+            continue  # nothing to take off
+        if r < 0 and crowded[i] and not occupied[i]:
+            r = _row_beside(table, keys, hit_table, hit_cells, cell)
+            if r >= 0:
+                if sums[r, 3] > 0.0:
+                    for c in range(3):
+                        sums[r, c] *= 1.0 + w / sums[r, 3]
+                sums[r, 3] += w
+                gained[r] += w
+                continue
         if r < 0:
-            if weight[i] <= 0.0:
-                continue  # nothing to take off
             r = n
             table[place] = r
             keys[r] = key
@@ -234,7 +268,8 @@ def _add(voxel, label, sums, sources, gained, n, points, occupied, weight, fine_
             for c in range(3):
                 voxel[r, c] = cell[c]
             n += 1
-        w = weight[i]
+            if some_crowded and occupied[i]:
+                n_hit_cells = _enter_hit(hit_table, hit_cells, n_hit_cells, voxel[r])
         if w < 0.0 and sums[r, 3] + w <= _LEAST_WEIGHT:
             gained[r] -= sums[r, 3]
             sums[r, :] = 0.0
@@ -244,6 +279,33 @@ def _add(voxel, label, sums, sources, gained, n, points, occupied, weight, fine_
         sums[r, 3] += w
         gained[r] += w
     return n
+
+
+@nb.njit(nogil=True, error_model="numpy", cache=True)
+def _enter_hit(hit_table, hit_cells, n, voxel):
+    """Note the free voxel that a hit's voxel lies in; how many there are now."""
+    key = pack(0, voxel[0] >> 1, voxel[1] >> 1, voxel[2] >> 1)
+    place = find(hit_table, hit_cells, key)
+    if hit_table[place] < 0:
+        hit_table[place] = n
+        hit_cells[n] = key
+        n += 1
+    return n
+
+
+@nb.njit(nogil=True, error_model="numpy", cache=True)
+def _row_beside(table, keys, hit_table, hit_cells, cell):
+    """A free row of one of the 26 voxels around; -1 if there is none, or a hit among them."""
+    found = np.int64(-1)
+    for dx in range(-1, 2):
+        for dy in range(-1, 2):
+            for dz in range(-1, 2):
+                key = pack(0, cell[0] + dx, cell[1] + dy, cell[2] + dz)
+                if hit_table[find(hit_table, hit_cells, key)] >= 0:
+                    return np.int64(-1)
+                if found < 0:
+                    found = np.int64(table[find(table, keys, key)])
+    return found
 
 
 @nb.njit(nogil=True, error_model="numpy", cache=True)

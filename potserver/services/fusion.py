@@ -118,9 +118,7 @@ def fuse(
     taken = KernelSet.empty()
     if settings.carry_into_map:
         taken = _wanted(carried.moved(-region.origin_m), region.kernels, points, grid, threads)
-    new_rows = add_evidence(
-        region, points, labelled.occupied, beam_weights(labelled), source, memory=settings.memory
-    )
+    new_rows = add_evidence(region, points, labelled.occupied, beam_weights(labelled), source, settings)
     added = add_kernels(region, new_rows, MapKernels.new(taken, CARRIED), planar, settings, threads)
     fitted = _fit(region, lower - region.origin_m, upper - region.origin_m, settings, threads)
     return Fused(
@@ -189,13 +187,13 @@ def add_evidence(
     occupied: Bool,
     weight: Float64 | Float32,
     source: int,
-    *,
-    memory: float,
+    settings: MappingSettings,
 ) -> evidence.Rows:
     """Put labelled samples, (N, 3) m in the region's frame, into its rows; the rows that are new."""
     n_before = len(region.rows.occupied)
-    rows, gained = evidence.add(region.rows, points, occupied, weight, region.grid.fine_m, source)
-    evidence.forget(rows.sums, gained, evidence.cells(rows), memory)
+    crowded = region.crowded(points, settings.crowded_share)
+    rows, gained = evidence.add(region.rows, points, occupied, weight, region.grid.fine_m, source, crowded)
+    evidence.forget(rows.sums, gained, evidence.cells(rows), settings.memory)
     region.rows = rows
     return rows.take(slice(n_before, None))
 

@@ -91,7 +91,7 @@ def merge(
                     data.occupied[data.source == source],
                     data.sums[data.source == source, 3],
                     number,
-                    memory=settings.memory,
+                    settings,
                 )
                 for source, number in enumerate(numbers)
             ]

@@ -42,9 +42,7 @@ def state_of_places(
         centre = (tile[members[0]] + 0.5) * grid.size_m
         region = Region.of(tiled, centre, centre)
         local = points[members] - region.origin_m
-        add_evidence(
-            region, local, occupied[members], weight[members], number, memory=service.settings.memory
-        )
+        add_evidence(region, local, occupied[members], weight[members], number, service.settings)
         tiled = tiled.with_tiles(region.tiles(centre, centre), service.settings.observed_activation)
     evidence_only = MapState(snapshot=KernelMap(KernelSet.empty()), tiled=tiled)
     service.merge(evidence_only, np.eye(4))

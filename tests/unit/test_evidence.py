@@ -129,3 +129,33 @@ def test_nothing_to_fade() -> None:
     assert (
         fade(rows, np.zeros((0, 3)), np.zeros(0, bool), np.zeros(3), fine_m=FINE_M, rate=0.1, gap_m=0.3) == 0
     )
+
+
+def test_where_rows_are_many_free_samples_count_at_a_row_beside_them() -> None:
+    rows = _rows([[0.1, 0.1, 0.1], [5.0, 5.0, 5.0]], [False, True])
+    points = np.array([[0.5, 0.1, 0.1], [0.1, 0.9, 0.1], [5.3, 5.0, 5.0], [0.5, 0.5, 0.5]])
+    occupied = np.array([False, False, False, True])
+    where = positions(rows, FINE_M)
+    spread, _ = add(rows, points, occupied, np.full(4, 0.5), FINE_M)
+    assert len(spread.occupied) == 6
+    crowded, gained = add(rows, points, occupied, np.full(4, 0.5), FINE_M, crowded=np.ones(4, bool))
+    # beside a free row; beyond its neighbours; beside a hit; a hit itself
+    assert len(crowded.occupied) == 5
+    np.testing.assert_allclose(crowded.sums[:2, 3], [1.5, 1.0])
+    np.testing.assert_allclose(positions(crowded, FINE_M)[:2], where, atol=1e-6)
+    assert gained.sum() == pytest.approx(2.0)
+    assert crowded.sums[:, 3].sum() == pytest.approx(spread.sums[:, 3].sum())
+
+
+def test_rows_beside_new_hits_are_not_joined() -> None:
+    rows = _rows([[0.1, 0.1, 0.1]], False)
+    points, occupied = np.array([[0.5, 0.1, 0.1], [0.5, 0.5, 0.1]]), np.array([True, False])
+    joined, _ = add(rows, points, occupied, np.ones(2), FINE_M, crowded=np.ones(2, bool))
+    assert len(joined.occupied) == 3
+
+
+def test_rows_of_others_are_not_joined() -> None:
+    rows = _rows([[0.1, 0.1, 0.1]], False)
+    point = np.array([[0.5, 0.1, 0.1]])
+    other, _ = add(rows, point, np.array([False]), np.ones(1), FINE_M, 1, np.ones(1, bool))
+    np.testing.assert_array_equal(other.source, [0, 1])
