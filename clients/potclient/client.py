@@ -281,7 +281,7 @@ class MapClient:
         timeout_s = self._timeout_s if timeout_s is None else timeout_s
         querier = self._querier(self.keys.query(op))
         until = time.monotonic() + timeout_s
-        while not _is_matching(querier):
+        while not self._zenoh_call(_is_matching, querier):
             if time.monotonic() >= until:
                 raise NoServerError(f"nobody at {self._where} answers {op!r} for map {self.keys.map_id!r}")
             time.sleep(0.005)
@@ -1069,7 +1069,7 @@ class MapClient:
             self._servers_changed
         ):  # the tokens of a session that was opened just now may still be on their way
             is_alive = bool(self._servers_changed.wait_for(self._servers_of_map, _DIAGNOSIS_TIMEOUT_S))
-        if not _is_matching(querier):
+        if not self._zenoh_call(_is_matching, querier):
             if is_alive:
                 return LostReplyError(
                     f"{key}: a server for map {self.keys.map_id!r} is up but does not offer this question:"

@@ -787,3 +787,17 @@ def test_a_load_test_that_loses_receipts_says_so(server: FakeServer) -> None:
     assert report.clouds.unknown > 0
     assert report.clouds.accounted
     assert report.failed == {"InternalError": report.asked}
+
+
+def test_a_question_whose_client_is_closed_meanwhile_says_so(
+    server: FakeServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with MapClient(server.endpoint, map="nobody.serves.this", timeout_s=0.5) as client:
+
+        def close_and_ask(querier: zenoh.Querier) -> bool:
+            client.close()
+            return bool(querier.matching_status)
+
+        monkeypatch.setattr("potclient.client._is_matching", close_and_ask)
+        with pytest.raises(ClosedError):
+            client.info()
