@@ -80,7 +80,8 @@ def sdist(root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def unpacked_sdist(sdist: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("unpacked")
     with tarfile.open(sdist) as archive:
-        archive.extractall(out, filter="data")
+        # the first releases of 3.10 and 3.11 have no filters yet
+        archive.extractall(out, **({"filter": "data"} if hasattr(tarfile, "data_filter") else {}))
     (folder,) = out.iterdir()
     return folder
 

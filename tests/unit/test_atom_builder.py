@@ -133,7 +133,7 @@ def test_no_atom_holds_a_held_out_hit() -> None:
     result = learn_scan(scan_tasks(made, Path.cwd())[0])
     assert result.candidates
     recorded, held = recording[2], in_turn[2].points[in_turn[2].occupied]
-    for atom, _, _ in result.candidates:
+    for atom, *_ in result.candidates:
         bearing = yaw_of(recorded.T_map_sensor) + int(atom.provenance["sector"]) * atom.azimuth_width_rad
         hits = atom.hit_points @ rotation_z(bearing).T + recorded.T_map_sensor[:3, 3]
         assert np.linalg.norm(hits[:, None] - held, axis=2).min() > 1e-4
