@@ -1,6 +1,6 @@
 """How long do ghosts live: what maps say of places that a car has left, against how often later scans saw through them.
 
-    python benchmarks/ghosts.py [DATASET] [--scans 0:240:2] [--json FILE] [-o docs/ghosts.png]
+    python benchmarks/ghosts.py [DATASET] [--scans 0:160:2] [--json FILE] [-o docs/ghosts.png]
 
 In a dynamic town, end points of beams on cars and people are followed. Once the solids have gone from there, and nothing else
 is near, the maps are asked after every scan how likely the place still is occupied. A scan sees through a place if one of
@@ -77,7 +77,9 @@ def main() -> int:
     maps = _maps(options)
     sums = {kind: {m.name: np.zeros((_MOST + 1, 2)) for m in maps} for kind in ("passed by", "stood there")}
     places, rng = Places.none(), np.random.default_rng(0)
-    for number in track(range(first, last, step), description="scans", console=Console(stderr=True)):
+    for number in track(
+        range(len(recording))[first:last:step], description="scans", console=Console(stderr=True)
+    ):
         scan = recording[number]
         for a_map in maps:
             a_map.integrate(scan)
@@ -103,8 +105,8 @@ def _options() -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("dataset", nargs="?", default="town:terraces:dynamic:vlp16:7")
-    parser.add_argument("--scans", default="0:240:2", metavar="START:STOP:STEP")
+    parser.add_argument("dataset", nargs="?", default="town:terraces:dynamic:vlp16:200m:7")
+    parser.add_argument("--scans", default="0:160:2", metavar="START:STOP:STEP")
     parser.add_argument("--max-range", type=float, default=25.0, metavar="M")
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--json", metavar="FILE", help="write the numbers")
