@@ -87,16 +87,17 @@ def main() -> int:
         _count(sums, maps, places)
         places = places.add(*_on_movers(recording.town, scan, rng))
     console.print(f"{options.dataset}, scans {options.scans}, to {options.max_range:g} m")
-    report = {
+    names = [a_map.name for a_map in maps]
+    report: dict[str, Any] = {
         kind: {name: (s[:, 0] / np.maximum(s[:, 1], 1)).tolist() for name, s in of.items()}
         for kind, of in sums.items()
     }
     report["places"] = {kind: next(iter(of.values()))[:, 1].astype(int).tolist() for kind, of in sums.items()}
-    console.print(_table(report, [m.name for m in maps]))
+    console.print(_table(report, names))
     if options.json:
         Path(options.json).write_text(json.dumps(report, indent=1))
     if options.out:
-        _draw(report, [m.name for m in maps], options.out)
+        _draw(report, names, options.out)
         console.print(f"curves: {options.out}")
     return 0
 
@@ -151,7 +152,7 @@ def _followed(places: Places, town: Town, scan: RecordedScan) -> Places:
     places.n_occupied += occupied & ~places.left
     gone = ~occupied & clear
     places.n_through += gone & _seen_through(places.points, scan)
-    keep = gone | (~places.left & occupied)  # left and clear, or still there
+    keep = gone | ~places.left  # a car that pulls out is near for a while
     places.left |= gone
     return places.take(keep & (places.n_through <= _MOST))
 
@@ -184,9 +185,13 @@ def _table(report: dict[str, Any], names: list[str]) -> Table:
         table.add_column(str(count), justify="right")
     for kind in ("passed by", "stood there"):
         for name in names:
-            table.add_row(f"{kind}: {name}", *(f"{report[kind][name][c]:.2f}" for c in _SHOWN))
+            table.add_row(f"{kind}: {name}", *(_mean(report, kind, name, c) for c in _SHOWN))
         table.add_row(f"{kind}: places", *(f"{report['places'][kind][c]:,}" for c in _SHOWN))
     return table
+
+
+def _mean(report: dict[str, Any], kind: str, name: str, count: int) -> str:
+    return f"{report[kind][name][count]:.2f}" if report["places"][kind][count] else "-"
 
 
 def _draw(report: dict[str, Any], names: list[str], path: str) -> None:
