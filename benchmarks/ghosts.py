@@ -2,9 +2,10 @@
 
     python benchmarks/ghosts.py [DATASET] [--scans 0:160:2] [--json FILE] [-o docs/ghosts.png]
 
-In a dynamic town, end points of beams on cars and people are followed. Once the solids have gone from there, and nothing else
-is near, the maps are asked after every scan how likely the place still is occupied. A scan sees through a place if one of
-its beams passes nearer than 0.15 m to it and ends at least 0.3 m beyond, or does not end.
+In a dynamic town, end points of beams on cars and people are followed: of those that pass while the sensor drives, and of a
+parked car that leaves while the sensor stands. Once the solids have gone from there, and nothing else is near, the maps are
+asked after every scan how likely the place still is occupied. A scan sees through a place if one of its beams passes nearer
+than 0.15 m to it and ends at least 0.3 m beyond, or does not end.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from rich.table import Table
 from scipy.spatial import cKDTree
 
 from potclient.datasets import RecordedScan, open_dataset
-from potclient.towns import Town, TownRecording
+from potclient.towns import PERIOD_S, Town, TownRecording
 from potclient.towns.solids import SolidSet
 from potserver import AtomDictionary, MappingSettings
 from potserver.evaluation.mappers import Mapper, ServiceMap
@@ -32,7 +33,9 @@ from potserver.evaluation.peers import peer_named
 _INSIDE_M = 0.1  # along the beam: an end point moved so far is inside what it met
 _CLEAR_M = 0.4  # around a ghost nothing else may be
 _PASSES_M, _BEYOND_M = 0.15, 0.3
-_STOOD = 5  # scans that found a place occupied: from there on its car stood
+_PASSED, _STOOD = "passed by", "stood there"
+_SCANS_STOOD = 5  # that found a place occupied: from there on its car stood
+_BEFORE_S, _AFTER_S = 2.5, 6.0  # about the moment at which a parked car leaves
 _A_SCAN = 200  # places that are followed from each scan on, at most
 _MOST = 20  # scans that saw through
 _SHOWN = (0, 1, 2, 3, 5, 8, 12, 16, 20)
@@ -70,29 +73,19 @@ class Places:
 def main() -> int:
     options = _options()
     console = Console(width=120)
-    recording = open_dataset(options.dataset, max_range_m=options.max_range)
-    if not isinstance(recording, TownRecording) or not recording.town.dynamic:
-        raise SystemExit(f"{options.dataset}: need a dynamic town, such as town:terraces:dynamic:7")
+    driven, stood = _town(options.dataset, options), _town(options.leaving, options)
     first, last, step = (int(n) for n in options.scans.split(":"))
-    maps = _maps(options)
-    sums = {kind: {m.name: np.zeros((_MOST + 1, 2)) for m in maps} for kind in ("passed by", "stood there")}
-    places, rng = Places.none(), np.random.default_rng(0)
-    for number in track(
-        range(len(recording))[first:last:step], description="scans", console=Console(stderr=True)
-    ):
-        scan = recording[number]
-        for a_map in maps:
-            a_map.integrate(scan)
-        places = _followed(places, recording.town, scan)
-        _count(sums, maps, places)
-        places = places.add(*_on_movers(recording.town, scan, rng))
-    console.print(f"{options.dataset}, scans {options.scans}, to {options.max_range:g} m")
-    names = [a_map.name for a_map in maps]
-    report: dict[str, Any] = {
-        kind: {name: (s[:, 0] / np.maximum(s[:, 1], 1)).tolist() for name, s in of.items()}
-        for kind, of in sums.items()
+    runs = {
+        _PASSED: (driven, range(len(driven))[first:last:step]),
+        _STOOD: (stood, _standing(stood.town, step)),
     }
-    report["places"] = {kind: next(iter(of.values()))[:, 1].astype(int).tolist() for kind, of in sums.items()}
+    report: dict[str, Any] = {"places": {}}
+    for kind, (recording, numbers) in runs.items():
+        report[kind], report["places"][kind] = _follow(recording, numbers, kind, options)
+    names = list(report[_PASSED])
+    console.print(
+        f"driving: {options.dataset}, {options.scans}; standing: {options.leaving}, {len(runs[_STOOD][1])} scans"
+    )
     console.print(_table(report, names))
     if options.json:
         Path(options.json).write_text(json.dumps(report, indent=1))
@@ -102,11 +95,57 @@ def main() -> int:
     return 0
 
 
+def _town(dataset: str, options: argparse.Namespace) -> TownRecording:
+    recording = open_dataset(dataset, max_range_m=options.max_range)
+    if not isinstance(recording, TownRecording) or not recording.town.dynamic:
+        raise SystemExit(f"{dataset}: need a dynamic town, such as town:terraces:dynamic:7")
+    return recording
+
+
+def _standing(town: Town, step: int) -> range:
+    """Stops the sensor where it comes nearest to a car as that leaves; the scans from before that moment to after it."""
+    starts = town.traffic.start_s
+    parked = np.flatnonzero(
+        np.isfinite(starts) & (starts > _BEFORE_S) & (starts + _AFTER_S < town.duration_s)
+    )
+    if not len(parked):
+        raise SystemExit("--leaving: no car leaves in time in this town; take another seed")
+    away = [np.hypot(*(town.pose(starts[k])[:2, 3] - town.traffic.base[k])) for k in parked]
+    start_s = starts[parked[int(np.argmin(away))]]
+    pose = town.pose(start_s)
+    town.pose = lambda time_s: pose  # type: ignore[method-assign]
+    return range(round((start_s - _BEFORE_S) / PERIOD_S), round((start_s + _AFTER_S) / PERIOD_S), step)
+
+
+def _follow(
+    recording: TownRecording, numbers: range, kind: str, options: argparse.Namespace
+) -> tuple[dict[str, list[float]], list[int]]:
+    """Mean probability of each map by the count of scans that saw through, and how many places it is the mean of."""
+    maps = _maps(options)
+    sums = {a_map.name: np.zeros((_MOST + 1, 2)) for a_map in maps}
+    places, rng = Places.none(), np.random.default_rng(0)
+    for number in track(numbers, description=kind, console=Console(stderr=True)):
+        scan = recording[number]
+        for a_map in maps:
+            a_map.integrate(scan)
+        places = _followed(places, recording.town, scan)
+        chosen = places.take(places.left & ((places.n_occupied >= _SCANS_STOOD) == (kind == _STOOD)))
+        for a_map in maps:
+            p, known = a_map.occupancy(chosen.points)
+            np.add.at(
+                sums[a_map.name], chosen.n_through, np.stack([np.where(known, p, 0.5), np.ones(len(p))], 1)
+            )
+        places = places.add(*_on_movers(recording.town, scan, rng))
+    means = {name: (s[:, 0] / np.maximum(s[:, 1], 1)).tolist() for name, s in sums.items()}
+    return means, next(iter(sums.values()))[:, 1].astype(int).tolist()
+
+
 def _options() -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("dataset", nargs="?", default="town:terraces:dynamic:vlp16:200m:7")
+    parser.add_argument("--leaving", default="town:terraces:dynamic:vlp16:200m:3", metavar="DATASET")
     parser.add_argument("--scans", default="0:160:2", metavar="START:STOP:STEP")
     parser.add_argument("--max-range", type=float, default=25.0, metavar="M")
     parser.add_argument("--threads", type=int, default=1)
@@ -165,17 +204,6 @@ def _seen_through(points: np.ndarray, scan: RecordedScan) -> np.ndarray:
     return (apart * distance < _PASSES_M) & (length[nearest] > distance + _BEYOND_M)
 
 
-def _count(sums: dict[str, dict[str, np.ndarray]], maps: list[Mapper], places: Places) -> None:
-    chosen = places.take(places.left)
-    stood = chosen.n_occupied >= _STOOD
-    for a_map in maps:
-        p, known = a_map.occupancy(chosen.points)
-        p = np.where(known, p, 0.5)
-        for kind, members in (("passed by", ~stood), ("stood there", stood)):
-            np.add.at(sums[kind][a_map.name][:, 0], chosen.n_through[members], p[members])
-            np.add.at(sums[kind][a_map.name][:, 1], chosen.n_through[members], 1)
-
-
 def _table(report: dict[str, Any], names: list[str]) -> Table:
     table = Table(
         box=None, pad_edge=False, header_style="dim", title="mean P(occupied) where something has left"
@@ -183,7 +211,7 @@ def _table(report: dict[str, Any], names: list[str]) -> Table:
     table.add_column("scans that saw through", no_wrap=True)
     for count in _SHOWN:
         table.add_column(str(count), justify="right")
-    for kind in ("passed by", "stood there"):
+    for kind in (_PASSED, _STOOD):
         for name in names:
             table.add_row(f"{kind}: {name}", *(_mean(report, kind, name, c) for c in _SHOWN))
         table.add_row(f"{kind}: places", *(f"{report['places'][kind][c]:,}" for c in _SHOWN))
@@ -198,7 +226,7 @@ def _draw(report: dict[str, Any], names: list[str], path: str) -> None:
     import matplotlib.pyplot as plt
 
     figure, axes = plt.subplots(1, 2, figsize=(9.0, 3.4), sharey=True, layout="constrained")
-    for axis, kind in zip(axes, ("passed by", "stood there"), strict=True):
+    for axis, kind in zip(axes, (_PASSED, _STOOD), strict=True):
         enough = np.array(report["places"][kind]) >= 30
         count = np.arange(_MOST + 1)
         for name in names:
