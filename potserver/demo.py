@@ -157,8 +157,9 @@ def _run_map(endpoint: str, name: str, recording: Recording, out: Path, console:
                 status.update(f"scan {number + 1} of {len(recording)}")
                 scan, labels = hold_out.split(recorded)
                 planar = scan.is_planar
-                points = scan.points[:, :2] if planar else scan.points
-                receipt = client.integrate(points, scan.T_map_sensor, robot="demo", is_return=scan.is_return)
+                receipt = client.integrate(
+                    scan.to_send, scan.T_map_sensor, robot="demo", is_return=scan.is_return
+                )
                 receipts.append(receipt)
                 held.append(labels)
                 hits.append(scan.in_map[scan.is_return])

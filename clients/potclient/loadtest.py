@@ -233,7 +233,7 @@ def _robot(
             k = i * len(scans) // max(1, settings.robots)
             while beat < until and not stop.wait(max(0.0, beat - time.monotonic())):
                 scan = scans[k % len(scans)]
-                client.publish(scan.points, scan.T_map_sensor, is_return=scan.is_return, robot=robot)
+                client.publish(scan.to_send, scan.T_map_sensor, is_return=scan.is_return, robot=robot)
                 k += 1
                 beat += 1.0 / settings.rate_hz
             client.flush(2 * settings.receipt_timeout_s + 6.0)  # both credits may run out one after the other

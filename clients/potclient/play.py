@@ -169,7 +169,7 @@ class _Book:
         wait: bool,
     ) -> None:
         seq = client.publish(
-            scan.points,
+            scan.to_send,
             scan.T_map_sensor,
             robot=robot,
             is_return=scan.is_return,
@@ -187,7 +187,7 @@ class _Book:
     ) -> None:
         try:
             receipt = client.integrate(
-                scan.points, scan.T_map_sensor, robot=robot, is_return=scan.is_return, stamp_ns=stamp_ns
+                scan.to_send, scan.T_map_sensor, robot=robot, is_return=scan.is_return, stamp_ns=stamp_ns
             )
         except MapServerError as error:
             if error.receipt is None:

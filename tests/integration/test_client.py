@@ -717,6 +717,7 @@ def test_playing_a_recording_accounts_for_every_scan(
     assert [s.index for s in report.scans] == sorted(seen) == list(range(5))
     assert report.held_out is not None
     assert report.held_out.n == report.n_held_out > 0
+    assert {c.points.shape[1] for c in server.clouds} == {2}, "that is how a server knows planar scans"
     sent = [c.points.shape[0] for c in server.clouds]
     assert sent == [s.n_points for s in report.scans]
     assert all(n < len(scan) for n, scan in zip(sent, recording, strict=True)), (

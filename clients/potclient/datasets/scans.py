@@ -30,6 +30,11 @@ class RecordedScan:
         return len(self.points)
 
     @property
+    def to_send(self) -> Float32:
+        """(N, 3) m, or (N, 2) of a planar scan: that is how a server knows that it is one."""
+        return self.points[:, :2] if self.is_planar else self.points
+
+    @property
     def in_map(self) -> Float64:
         """(N, 3) m, map frame."""
         points: Float64 = self.points.astype(np.float64)
