@@ -8,7 +8,6 @@ map      one row: everything else (`MapRecord`) as JSON, and its digest; it coun
 from __future__ import annotations
 
 import contextlib
-import os
 import sqlite3
 import time
 from collections.abc import Iterable, Mapping
@@ -22,6 +21,7 @@ import numpy as np
 from potschemas import __version__
 from potserver.adapters.sqlite import Kind, connect, connect_read_only, reading, transaction
 from potserver.adapters.tile_codec import DIGEST_BYTES, decode_tile, digest_of, encode_tile
+from potserver.domain.folders import sync_folder
 from potserver.domain.kernel_map import KernelMap
 from potserver.domain.map_state import MapState
 from potserver.domain.running_scores import RunningScores
@@ -245,17 +245,6 @@ def describe(saved: SavedMap, path: Path) -> TileTable:
         n_kernels=sum(len(tile.kernels) for tile in tiles),
         n_bytes=n_bytes,
     )
-
-
-def sync_folder(folder: Path) -> None:
-    """Make a new name last: on a POSIX disk the folder is a file of its own."""
-    if os.name != "posix":
-        return
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
 
 
 def _record_of(state: MapState, origin: Origin, tiles: Mapping[TileIndex, tuple[int, int]]) -> MapRecord:

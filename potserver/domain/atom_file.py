@@ -29,6 +29,7 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save as to_safetensors
 
+from potserver.domain.folders import sync_folder
 from potserver.domain.types import Atom, KernelSet
 from potserver.errors import BadPointsError, DictionaryError, EmptyError, ShapeError
 
@@ -100,7 +101,7 @@ def write_atoms(path: Path, atoms: Sequence[Atom]) -> None:
             stream.flush()
             os.fsync(stream.fileno())
         partial.replace(path)
-        _sync_folder(path.parent)
+        sync_folder(path.parent)
     except OSError as error:
         with contextlib.suppress(OSError):
             partial.unlink()
@@ -238,14 +239,3 @@ def _parse_record(path: Path, number: int, record: object) -> AtomRecord:
         ):
             return parsed
     raise DictionaryError(f"{path}: atom number {number} is incomplete, or its fields have the wrong types")
-
-
-def _sync_folder(folder: Path) -> None:
-    """Make a rename last: on a POSIX disk the folder is a file of its own."""
-    if os.name != "posix":
-        return
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
