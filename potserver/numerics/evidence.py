@@ -5,7 +5,7 @@ centre. So it stands at their mean, rows of two maps add, and what was added can
 half the resolution, free samples in voxels of the resolution; each source, a robot, has rows of its own, so that it can be
 taken out. There are never more rows than voxels times sources, whatever is seen.
 
-All functions are pure but for `forget`, `fade` and `decay`, which scale sums in place.
+All functions are pure but for `forget` and `fade`, which scale sums in place.
 """
 
 from __future__ import annotations
@@ -209,7 +209,9 @@ def fade(
 
 
 def decay(rows: Rows, factor: float) -> Rows:
-    """All evidence scaled, say by age."""
+    """All evidence scaled, say by age; the same rows if by 1, as on every scan of a map that does not age."""
+    if factor == 1.0:
+        return rows
     return rows._replace(sums=rows.sums * np.float32(factor))
 
 

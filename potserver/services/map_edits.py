@@ -99,7 +99,7 @@ def merge(
         planar = len(where) > 0 and float(np.ptp(where[:, 2])) < 1e-4 * theirs.grid.fine_m
         add_kernels(region, new, carried, planar, settings, threads)
         tiles = region.tiles(lower, upper, revision=moment.revision, stamp_ns=moment.stamp_ns)
-        ours = ours.with_tiles(tiles, settings.observed_activation)
+        ours = ours._replace(tiles={**ours.tiles, **tiles})  # indexed once, when all is settled
         touched.update(tiles)
     return _settle(ours, touched, settings, moment, threads)
 
@@ -149,6 +149,8 @@ def _settle(
     for _ in range(_SWEEPS):
         for part in parts:
             tiles, _ = refit(tiled, part, settings, moment, threads=threads)
-            tiled = tiled.with_tiles(tiles, settings.observed_activation)
+            tiled = tiled._replace(tiles={**tiled.tiles, **tiles})
             done.update(tiles)
-    return tiled, done | set(changed)
+    done.update(changed)
+    settled = {index: tiled.tiles[index] for index in done if index in tiled.tiles}
+    return tiled.with_tiles(settled, settings.observed_activation, threads=threads), done
