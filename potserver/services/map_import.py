@@ -43,7 +43,9 @@ def state_of_places(
         region = Region.of(tiled, centre, centre)
         local = points[members] - region.origin_m
         add_evidence(region, local, occupied[members], weight[members], number, service.settings)
-        tiled = tiled.with_tiles(region.tiles(centre, centre), service.settings.observed_activation)
+        tiled = tiled._replace(
+            tiles={**tiled.tiles, **region.tiles(centre, centre)}
+        )  # without kernels: nothing to index
     evidence_only = MapState(snapshot=KernelMap(KernelSet.empty()), tiled=tiled)
     service.merge(evidence_only, np.eye(4))
     return service.state

@@ -12,7 +12,6 @@ import numpy as np
 from potserver.domain.types import Bool, Float32, Float64, KernelSet
 from potserver.errors import SolverError
 from potserver.numerics.feature_blocks import feature_blocks
-from potserver.numerics.geometry import voxel_pick
 from potserver.numerics.kernel_index import build_index, latent_sums
 from potserver.numerics.warm_fit import warm_fit
 
@@ -22,21 +21,6 @@ _GAMMA_SHAPE = 100.0  # a placed kernel's width is known to 10 %
 def gamma_of_spacing(spacing_m: float) -> float:
     """1/m^2: the width at which kernels of this spacing overlap smoothly, a length-scale of 0.6 spacings."""
     return 0.5 / (0.6 * spacing_m) ** 2
-
-
-def place_kernels(points: Float64, spacing_m: float, prior_var: float) -> KernelSet:
-    """One kernel in every occupied voxel of the points, weight 0 with the prior variance.
-
-    Args:
-        points: (N, 3) m.
-        spacing_m: Voxel edge.
-        prior_var: log-odds^2.
-    """
-    picked = voxel_pick(points, spacing_m)
-    hinge = (np.floor(points[picked] / spacing_m) + 0.5) * spacing_m
-    if len(points) and np.ptp(points[:, 2]) == 0.0:
-        hinge[:, 2] = points[0, 2]  # a planar map keeps its kernels in its plane
-    return kernels_at(hinge, spacing_m, prior_var)
 
 
 def kernels_at(hinge: Float64, spacing_m: float, prior_var: float) -> KernelSet:

@@ -6,16 +6,32 @@ import numpy as np
 import pytest
 
 from potserver.domain.kernel_map import KernelMap
-from potserver.domain.types import KernelSet
+from potserver.domain.types import Float64, KernelSet
 from potserver.errors import SolverError
 from potserver.numerics.beams import LabelledPoints
+from potserver.numerics.geometry import voxel_pick
 from potserver.numerics.warm_fit import WarmFit
 from potserver.services.refinement import (
     activation,
     gamma_of_spacing,
-    place_kernels,
+    kernels_at,
     refine,
 )
+
+
+def place_kernels(points: Float64, spacing_m: float, prior_var: float) -> KernelSet:
+    """One kernel in every occupied voxel of the points, weight 0 with the prior variance.
+
+    Args:
+        points: (N, 3) m.
+        spacing_m: Voxel edge.
+        prior_var: log-odds^2.
+    """
+    picked = voxel_pick(points, spacing_m)
+    hinge = (np.floor(points[picked] / spacing_m) + 0.5) * spacing_m
+    if len(points) and np.ptp(points[:, 2]) == 0.0:
+        hinge[:, 2] = points[0, 2]  # a planar map keeps its kernels in its plane
+    return kernels_at(hinge, spacing_m, prior_var)
 
 
 def _labelled(n: int = 600, seed: int = 0, planar: bool = False) -> LabelledPoints:
