@@ -27,6 +27,7 @@ import dataclasses
 import itertools
 import math
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any, NamedTuple
 
 import numba as nb
@@ -154,7 +155,8 @@ def fit_abhm(
     rng = np.random.default_rng(seed)
 
     means = _learn_means(problem, start, rng, on_epoch)
-    hinge_sd, shape, elbos = _learn_dispersions(problem, start, means, rng)
+    with _one_torch_thread():
+        hinge_sd, shape, elbos = _learn_dispersions(problem, start, means, rng)
     return AbhmPosterior(
         weight_mean=means.weights.mean,
         weight_var=means.weights.var,
@@ -445,6 +447,17 @@ def _learn_dispersions(
     if not (np.isfinite(sd).all() and np.isfinite(shape).all()):
         raise SolverError(f"the dispersions of {k} kernels on {n} points diverged")
     return sd, shape, elbos
+
+
+@contextmanager
+def _one_torch_thread() -> Iterator[None]:
+    """Arrays of K numbers are too small to share: torch's threads would wait for each other, longer than the work takes."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 def _weight_divergence(weights: _Weights, prior_var: float) -> float:

@@ -331,6 +331,25 @@ def test_nobody_elses_random_numbers_are_touched() -> None:
     assert _equal(one, _data().fit()), "and what others drew plays no part"
 
 
+def test_torchs_threads_play_no_part_and_are_left_as_they_were(monkeypatch: pytest.MonkeyPatch) -> None:
+    seen = []
+    learn = abhm._learn_dispersions
+    monkeypatch.setattr(
+        abhm, "_learn_dispersions", lambda *a: (seen.append(torch.get_num_threads()), learn(*a))[1]
+    )
+    before = torch.get_num_threads()
+    try:
+        fits = []
+        for threads in (1, 3):
+            torch.set_num_threads(threads)
+            fits.append(_data().fit())
+            assert torch.get_num_threads() == threads
+    finally:
+        torch.set_num_threads(before)
+    assert _equal(*fits)
+    assert seen == [1, 1], "arrays of K numbers are too small to share"
+
+
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_an_axis_in_which_all_points_agree_is_left_alone(axis: int) -> None:
     fit = _data(flat=axis).fit()
