@@ -13,7 +13,7 @@ from potserver.numerics.occupancy import predict_occupancy
 # Shares of the latent variance that may pull means towards 0.5; the best of them on the checked beams is used.
 MODERATIONS = (0.0, 0.0125, 0.025, 0.05, 0.1, 0.2, 0.4, 1.0)
 _MEMORY = 20_000.0  # points after which older ones count a third
-_ENOUGH = 2_000.0  # points before the choice is left to them
+_ENOUGH = 500.0  # points before the choice is left to them
 _N_BINS = 15
 _CLIP = 1e-6
 

@@ -6,6 +6,8 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from potserver.numerics.geometry import bounds
+
 Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
 
@@ -21,8 +23,8 @@ def sort_into_cubes(points: Float64, edge_m: float) -> tuple[Int64, Int64, Int64
         cuts: (C + 1,) where each cube starts.
         groups: (G + 1,) the first cube of each group of neighbouring cubes.
     """
-    lower = points.min(axis=0)
-    extent = points.max(axis=0) - lower
+    lower, upper = bounds(points)
+    extent = upper - lower
     while True:
         size = (extent / (_SPLIT * edge_m)).astype(np.int64) + 1
         if size.astype(np.float64).prod() * _SPLIT**3 <= _MAX_CUBES:

@@ -107,10 +107,19 @@ def positions(rows: Rows, fine_m: float) -> Float64:
 
     Samples on a face, as those of a planar map at z = 0, would else be in one voxel and their mean by rounding in the next.
     """
-    edge = np.where(rows.occupied, 0.5 * fine_m, fine_m)[:, None]
-    weight = np.maximum(rows.sums[:, 3:], np.float32(1e-9))
-    offset = np.clip(rows.sums[:, :3] / weight, -_INSIDE * edge, _INSIDE * edge)
-    return np.asarray((rows.voxel + 0.5) * edge + offset, np.float64)
+    return np.asarray(_positions(rows.voxel, rows.occupied, rows.sums, fine_m), np.float64)
+
+
+@nb.njit(nogil=True, error_model="numpy", cache=True)
+def _positions(voxel, occupied, sums, fine_m):
+    out = np.empty((len(occupied), 3))
+    for r in range(len(occupied)):
+        edge = 0.5 * fine_m if occupied[r] else fine_m
+        weight = max(sums[r, 3], np.float32(1e-9))
+        for c in range(3):
+            offset = min(max(np.float64(sums[r, c] / weight), -_INSIDE * edge), _INSIDE * edge)
+            out[r, c] = (voxel[r, c] + 0.5) * edge + offset
+    return out
 
 
 def is_alive(rows: Rows) -> Bool:

@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import math
 
+import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from potserver.numerics.voxel_hash import empty_table, find
+
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
+Int64 = NDArray[np.int64]
 Bool = NDArray[np.bool_]
 
 _ANGLE_STEPS = 2**32  # of a full turn
@@ -37,6 +41,30 @@ def sector_edges(n_sectors: int) -> Float64:
     return np.asarray(-width / 2.0 + width * np.arange(n_sectors + 1), np.float64)
 
 
+@nb.njit(nogil=True, error_model="numpy", cache=True)
+def bounds(points):
+    """(3,) and (3,): the lower and upper corner of (N, 3) points, N > 0; numpy is slow along so short an axis."""
+    lower, upper = points[0].copy(), points[0].copy()
+    for i in range(1, len(points)):
+        for c in range(3):
+            lower[c] = min(lower[c], points[i, c])
+            upper[c] = max(upper[c], points[i, c])
+    return lower, upper
+
+
+@nb.njit(nogil=True, error_model="numpy", cache=True)
+def inside_box(points, lower, upper):
+    """(N,) bool: which of (N, 3) points lie in a box, its faces included."""
+    out = np.empty(len(points), np.bool_)
+    for i in range(len(points)):
+        out[i] = (
+            (lower[0] <= points[i, 0] <= upper[0])
+            and (lower[1] <= points[i, 1] <= upper[1])
+            and (lower[2] <= points[i, 2] <= upper[2])
+        )
+    return out
+
+
 def in_sector(
     points: NDArray[np.floating], azimuth_min_rad: float, azimuth_max_rad: float, radius_m: float
 ) -> Bool:
@@ -61,10 +89,24 @@ def voxel_pick(points: NDArray[np.floating], voxel_m: float) -> NDArray[np.intp]
     if len(points) == 0:
         return np.zeros(0, np.intp)
     cell = np.floor(points / voxel_m).astype(np.int64)
-    cell -= cell.min(axis=0)
-    size = cell.max(axis=0) + 1
-    _, first = np.unique((cell[:, 2] * size[1] + cell[:, 1]) * size[0] + cell[:, 0], return_index=True)
-    return np.sort(first)
+    lower, upper = bounds(cell)
+    return np.asarray(_first_of_each(cell, lower, upper - lower + 1, empty_table(len(cell))), np.intp)
+
+
+@nb.njit(nogil=True, error_model="numpy", cache=True)
+def _first_of_each(cell, lower, size, table):
+    keys = np.empty(len(cell), np.int64)
+    picked = np.empty(len(cell), np.int64)
+    n = 0
+    for i in range(len(cell)):
+        key = ((cell[i, 2] - lower[2]) * size[1] + cell[i, 1] - lower[1]) * size[0] + cell[i, 0] - lower[0]
+        place = find(table, keys, key)
+        if table[place] < 0:
+            table[place] = n
+            keys[n] = key
+            picked[n] = i
+            n += 1
+    return picked[:n].copy()
 
 
 def thin(

@@ -21,7 +21,9 @@ from numpy.typing import NDArray
 
 from potserver.numerics.cubes import sort_into_cubes
 from potserver.numerics.fastexp import FAST, exp32
+from potserver.numerics.geometry import bounds, inside_box
 from potserver.numerics.threads import parallel_map, spans
+from potserver.numerics.voxel_hash import empty_table, find
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
@@ -51,6 +53,8 @@ class KernelIndex(NamedTuple):
     keys: Int64  # (K,) cell number inside its level, ascending within a level
     tau: float  # the cut
     median_reach_m: float
+    lower: Float64  # (3,) m: outside this box no kernel is reached; empty without kernels
+    upper: Float64
 
 
 def reach(gamma: Float64, weight: Float64, variance: Float64, tau: float, activation_cut: float) -> Float64:
@@ -94,8 +98,24 @@ def stack_sizes(hinge: Float64, gamma: Float64) -> Float64:
     cell = np.floor(hinge * np.exp2(level)[:, None])
     # cells are told apart by a mixed number, not by sorting rows: a rare collision only widens a reach
     key = (cell @ np.array([1.0, 7919.0, 104729.0]) + 15485863.0 * level).astype(np.int64)
-    _, inverse, count = np.unique(key, return_inverse=True, return_counts=True)
-    return count[inverse].astype(np.float64)
+    return np.asarray(_times_there(key, empty_table(len(key))), np.float64)
+
+
+@nb.njit(nogil=True, error_model="numpy", cache=True)
+def _times_there(key, table):
+    """(K,) how often each key is among them."""
+    keys, count = np.empty(len(key), np.int64), np.zeros(len(key), np.int64)
+    entry = np.empty(len(key), np.int64)
+    n = 0
+    for i in range(len(key)):
+        place = find(table, keys, key[i])
+        if table[place] < 0:
+            table[place] = n
+            keys[n] = key[i]
+            n += 1
+        entry[i] = table[place]
+        count[entry[i]] += 1
+    return count[entry]
 
 
 def build_index(
@@ -136,8 +156,8 @@ def build_index(
         members = np.flatnonzero(level == number)
         edge = max(top * 2.0 ** float(number), 1e-3)
         cell = np.floor(hinge[members] / edge).astype(np.int64)
-        corner = cell.min(axis=0)
-        size = cell.max(axis=0) - corner + 1
+        corner, last = bounds(cell)
+        size = last - corner + 1
         cell -= corner
         key = (cell[:, 2] * size[1] + cell[:, 1]) * size[0] + cell[:, 0]
         by_key = np.argsort(key, kind="stable")
@@ -147,6 +167,7 @@ def build_index(
         corners.append(corner)
         sizes.append(size)
         starts.append(starts[-1] + len(members))
+    lower, upper = bounds(hinge) if len(hinge) else (np.full(3, np.inf), np.full(3, -np.inf))
     permutation = np.concatenate(order) if order else np.zeros(0, np.int64)
     columns = np.stack([-gamma, weight, variance, r])[:, permutation].astype(np.float32)
     return KernelIndex(
@@ -160,6 +181,8 @@ def build_index(
         keys=np.concatenate(keys) if keys else np.zeros(0, np.int64),
         tau=tau,
         median_reach_m=float(np.median(r)) if len(r) else 1.0,
+        lower=lower - r.max(initial=0.0),
+        upper=upper + r.max(initial=0.0),
     )
 
 
@@ -211,9 +234,7 @@ class IndexParts(NamedTuple):
     def of(indices: list[KernelIndex]) -> IndexParts:
         """Parts of a map; empty ones are left out."""
         used = [index for index in indices if len(index.hinge)]
-        reach = [index.columns[3].max() for index in used]
-        lower = [index.hinge.min(axis=0) - r for index, r in zip(used, reach, strict=True)]
-        upper = [index.hinge.max(axis=0) + r for index, r in zip(used, reach, strict=True)]
+        lower, upper = [index.lower for index in used], [index.upper for index in used]
         return IndexParts(used, np.reshape(lower, (-1, 3)), np.reshape(upper, (-1, 3)))
 
 
@@ -233,9 +254,10 @@ def latent_sums_of_parts(
         for a, b in pieces[slice(*span)]:
             members = order[a:b]
             x = points[members]
-            reached = (parts.lower <= x.max(axis=0)).all(axis=1) & (parts.upper >= x.min(axis=0)).all(axis=1)
+            lower, upper = bounds(x)
+            reached = (parts.lower <= upper).all(axis=1) & (parts.upper >= lower).all(axis=1)
             for number in np.flatnonzero(reached):
-                inside = ((x >= parts.lower[number]) & (x <= parts.upper[number])).all(axis=1)
+                inside = inside_box(x, parts.lower[number], parts.upper[number])
                 if inside.any():
                     sums = latent_sums(parts.indices[number], x[inside])
                     for out, part in zip(total, sums, strict=True):
@@ -255,8 +277,8 @@ def group_points(points: Float64, scale_m: float) -> tuple[Int64, Int64]:
         cuts: (C + 1,) where each cube starts.
     """
     edge = 0.5 * scale_m
-    lower = points.min(axis=0)
-    extent = points.max(axis=0) - lower
+    lower, upper = bounds(points)
+    extent = upper - lower
     while True:
         edge = max(edge, float(extent.max()) / 2**20)  # 21 bits an axis
         cell = ((points - lower) / edge).astype(np.int64)
@@ -276,16 +298,16 @@ def _cut_sums(points, hinge, gamma, weight, variance, taus):
     cut_mean = np.zeros((n, n_taus))
     cut_var = np.zeros((n, n_taus))
     total = np.zeros(n)
+    exponent = np.empty(k)
     for i in range(n):
+        x, y, z = points[i]
+        for m in range(k):  # apart from what follows, so that the compiler makes SIMD code of it
+            dx, dy, dz = x - hinge[m, 0], y - hinge[m, 1], z - hinge[m, 2]
+            exponent[m] = gamma[m] * (dx * dx + dy * dy + dz * dz)
         for m in range(k):
-            d2 = 0.0
-            for c in range(3):
-                d = points[i, c] - hinge[m, c]
-                d2 += d * d
-            exponent = gamma[m] * d2
-            if exponent > 40.0:
+            if exponent[m] > 40.0:
                 continue
-            phi = np.exp(-exponent)
+            phi = np.exp(-exponent[m])
             a = weight[m] * phi
             b = variance[m] * phi * phi
             total[i] += b

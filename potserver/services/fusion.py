@@ -28,6 +28,7 @@ from potserver.errors import SolverError
 from potserver.numerics import evidence
 from potserver.numerics.beams import Beams, LabelledPoints, beam_weights
 from potserver.numerics.feature_blocks import feature_blocks, gradient_and_diagonal
+from potserver.numerics.geometry import bounds, inside_box
 from potserver.numerics.lattice_nodes import new_nodes
 from potserver.numerics.warm_fit import warm_fit
 from potserver.services.refinement import activation, gamma_of_spacing, kernels_at
@@ -106,7 +107,8 @@ def fuse(
     """
     grid = tiled.grid
     pad = grid.coarse_m
-    lower, upper = labelled.points.min(axis=0) - pad, labelled.points.max(axis=0) + pad
+    lower, upper = bounds(labelled.points)
+    lower, upper = lower - pad, upper + pad
     region = Region.of(tiled, lower - 4 * pad, upper + 4 * pad, moment.weight_of)
     points = labelled.points - region.origin_m
     if settings.fade_rate:
@@ -287,10 +289,12 @@ def _fit(region: Region, lower: Float64, upper: Float64, settings: MappingSettin
     grid, kernels = region.grid, region.kernels.kernels
     pad = grid.coarse_m
     where = evidence.positions(region.rows, grid.fine_m)
-    rows = np.flatnonzero(_inside(where, lower - 2 * pad, upper + 2 * pad) & evidence.is_alive(region.rows))
-    local = np.flatnonzero(_inside(kernels.hinge_mean, lower - 4 * pad, upper + 4 * pad))
+    rows = np.flatnonzero(
+        inside_box(where, lower - 2 * pad, upper + 2 * pad) & evidence.is_alive(region.rows)
+    )
+    local = np.flatnonzero(inside_box(kernels.hinge_mean, lower - 4 * pad, upper + 4 * pad))
     hinge = kernels.hinge_mean[local]
-    free = _inside(hinge, lower, upper)
+    free = inside_box(hinge, lower, upper)
     counts = evidence.counts(region.rows.sums, evidence.cells(region.rows), settings.saturation)
     blocks = feature_blocks(
         where[rows],
@@ -323,7 +327,3 @@ def _fit(region: Region, lower: Float64, upper: Float64, settings: MappingSettin
         prior_var=region.kernels.prior_var,
     ).take(keep)
     return fit.converged
-
-
-def _inside(points: Float64 | Float32, lower: Float64, upper: Float64) -> Bool:
-    return np.asarray(((points >= lower) & (points <= upper)).all(axis=1))

@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 
 from potserver.numerics.geometry import (
+    bounds,
     in_sector,
+    inside_box,
     rotated_diagonal,
     rotation_z,
     sector_edges,
@@ -103,3 +105,22 @@ def test_thinning_to_a_number_draws_among_the_voxels() -> None:
 
 def test_thinning_nothing() -> None:
     assert len(thin(np.zeros((0, 3)), 5, 1.0, np.random.default_rng(0))) == 0
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64, np.int64])
+@pytest.mark.parametrize("n", [1, 2, 500])
+def test_bounds_are_numpys(dtype: type, n: int) -> None:
+    points = np.random.default_rng(n).uniform(-1e6, 1e6, (n, 3)).astype(dtype)
+    lower, upper = bounds(points)
+    np.testing.assert_array_equal(lower, points.min(axis=0))
+    np.testing.assert_array_equal(upper, points.max(axis=0))
+
+
+def test_a_box_includes_its_faces() -> None:
+    rng = np.random.default_rng(0)
+    points = rng.integers(-2, 3, (400, 3)).astype(np.float64)
+    lower, upper = np.array([-1.0, 0.0, -2.0]), np.array([1.0, 0.0, 1.0])
+    wanted = ((points >= lower) & (points <= upper)).all(axis=1)
+    assert wanted.any()
+    np.testing.assert_array_equal(inside_box(points, lower, upper), wanted)
+    assert not inside_box(np.full((1, 3), np.nan), lower, upper).any()

@@ -52,7 +52,7 @@ def test_nothing_asked_changes_nothing() -> None:
 @pytest.mark.parametrize("scale", [1.0, 4.0])
 def test_the_surer_a_map_is_without_cause_the_more_it_is_moderated(scale: float) -> None:
     latent, var, truth = _answers(5000, 1, scale=scale)
-    few = RunningScores().with_points(latent[:500], var[:500], truth[:500], 0.05)
+    few = RunningScores().with_points(latent[:400], var[:400], truth[:400], 0.05)
     assert few.moderation(0.05) == 0.05, "too few to say"
     scores = RunningScores().with_points(latent, var, truth, 0.05)
     chosen = scores.moderation(0.05)
