@@ -8,6 +8,9 @@ READY := $(VENV)/.ready
 PYTHON ?=
 ARGS ?=
 
+# Tests are dealt out to a process a processor; more than four would want more memory than they save time.
+TEST_PROCESSES := -n auto --maxprocesses 4 --dist worksteal
+
 # Compiled numeric kernels are kept, so that only the first run pays for them.
 export NUMBA_CACHE_DIR := $(CURDIR)/$(VENV)/numba-cache
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
@@ -55,8 +58,8 @@ demo: $(READY) ## a server, robots and queries on this machine; pictures into ou
 	@$(BIN)/potserver demo $(ARGS)
 
 test: $(READY) ## all tests
-	@echo "test: pytest $(ARGS)"
-	@$(BIN)/python -m pytest --junit-xml=out/test/junit.xml $(ARGS)
+	@echo "test: pytest $(TEST_PROCESSES) $(ARGS)"
+	@$(BIN)/python -m pytest $(TEST_PROCESSES) --junit-xml=out/test/junit.xml $(ARGS)
 	@echo "test: results above, and in out/test/junit.xml"
 
 check: lint format-check types imports schemas-check ## style, types, layers, generated schemas

@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -80,6 +81,15 @@ def test_ray_builds_the_same_file(folder: Path) -> None:
     assert (folder / "ray.atoms").read_bytes() == (folder / "one.atoms").read_bytes()
 
 
+@pytest.fixture
+def interruptible() -> Iterator[None]:
+    """What runs these tests in the background may ignore SIGINT, and what they start would inherit that."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("interruptible")
 def test_an_interrupt_ends_the_workers_and_leaves_nothing(folder: Path) -> None:
     (folder / "endless.toml").write_text(ENDLESS)
     with subprocess.Popen(
