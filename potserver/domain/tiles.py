@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from potserver.domain.kernel_map import IndexedKernels
 from potserver.domain.types import Bool, Float32, Float64, KernelSet
 from potserver.errors import SettingsError, ShapeError
-from potserver.numerics.evidence import Rows, decay, is_alive
+from potserver.numerics.evidence import Rows, decay, is_alive, tile_of
 from potserver.numerics.threads import parallel_map
 from potserver.numerics.voxel_hash import CELL_LIMIT
 
@@ -251,8 +251,8 @@ class Region:
     def crowded(self, points: Float64, share: float) -> Bool:
         """(N,) which points, (N, 3) m in this frame, lie in tiles with at least so many rows a voxel of free space."""
         size = np.asarray(self.upper, np.int64) - np.asarray(self.lower, np.int64) + 1
-        row_tile = np.clip(self.rows.voxel // _tile_edge(self.rows, self.grid), 0, size - 1)
-        counts = np.bincount(_numbers(row_tile, size), minlength=int(size.prod()))
+        row_tile, _ = tile_of(self.rows, self.grid.voxels, size)
+        counts = np.bincount(row_tile, minlength=int(size.prod()))
         tile = np.clip(np.floor(points / self.grid.size_m), 0, size - 1).astype(np.int64)
         return np.asarray(counts[_numbers(tile, size)] >= share * self.grid.voxels**3)
 
@@ -266,16 +266,16 @@ class Region:
             revision, stamp_ns: Of the new tiles.
         """
         low, high = self.grid.index_of(lower_m), self.grid.index_of(upper_m)
+        size = np.asarray(self.upper, np.int64) - np.asarray(self.lower, np.int64) + 1
         rows = self.rows.take(is_alive(self.rows))
-        edge = _tile_edge(rows, self.grid)
-        row_tile = rows.voxel // edge
-        rows = rows._replace(voxel=(rows.voxel - row_tile * edge).astype(np.int32))
+        row_tile, voxel = tile_of(rows, self.grid.voxels, size)
+        rows = rows._replace(voxel=voxel)
         hinge = self.kernels.kernels.hinge_mean
         # rounding may put a kernel of the outermost tiles just outside
-        size = np.asarray(self.upper, np.int64) - np.asarray(self.lower, np.int64) + 1
         kernel_tile = np.clip(np.floor(hinge / self.grid.size_m), 0, size - 1).astype(np.int64)
         kernels = self.kernels.moved(np.asarray(-kernel_tile * self.grid.size_m, np.float64))
-        row_members, kernel_members = _by_tile(row_tile, size), _by_tile(kernel_tile, size)
+        row_members = _by_number(row_tile, int(size.prod()))
+        kernel_members = _by_number(_numbers(kernel_tile, size), int(size.prod()))
         out = {}
         for number, shift in enumerate(itertools.product(*(range(s) for s in size))):
             index = (self.lower[0] + shift[0], self.lower[1] + shift[1], self.lower[2] + shift[2])
@@ -291,10 +291,9 @@ def _tile_edge(rows: Rows, grid: TileGrid) -> NDArray[np.int64]:
     return np.where(rows.occupied, 2 * grid.voxels, grid.voxels)[:, None]
 
 
-def _by_tile(tile: NDArray[np.integer], size: NDArray[np.int64]) -> list[NDArray[np.intp]]:
-    """For each tile of the box, the numbers of what lies in it, ascending."""
-    number = _numbers(tile, size)
-    counts = np.bincount(number, minlength=int(size.prod()))
+def _by_number(number: NDArray[np.int64], n: int) -> list[NDArray[np.intp]]:
+    """For each of n numbers, where it stands, ascending."""
+    counts = np.bincount(number, minlength=n)
     return np.split(np.argsort(number, kind="stable"), np.cumsum(counts)[:-1])
 
 

@@ -127,6 +127,32 @@ def is_alive(rows: Rows) -> Bool:
     return rows.sums[:, 3] > _LEAST_WEIGHT
 
 
+def tile_of(rows: Rows, voxels: int, size: Int64) -> tuple[Int64, Int32]:
+    """Which tile of a box each row lies in, and its voxel counted from that tile's corner.
+
+    Args:
+        rows: In a frame whose origin is the box's lower corner.
+        voxels: Of free space along a tile's edge; of hits there are twice as many.
+        size: (3,) tiles along the box's axes.
+    Returns:
+        (R,) numbers of the tiles, z fastest, and (R, 3) voxels.
+    """
+    return _tile_of(rows.voxel, rows.occupied, voxels, size)
+
+
+@nb.njit(nogil=True, error_model="numpy", cache=True)
+def _tile_of(voxel, occupied, voxels, size):
+    number = np.zeros(len(occupied), np.int64)
+    local = np.empty((len(occupied), 3), np.int32)
+    for r in range(len(occupied)):
+        edge = 2 * voxels if occupied[r] else voxels
+        for c in range(3):
+            tile = voxel[r, c] // edge
+            number[r] = number[r] * size[c] + tile
+            local[r, c] = voxel[r, c] - tile * edge
+    return number, local
+
+
 class Cells(NamedTuple):
     """The cell, a free voxel with the hits in it, of each row: the unit in which evidence saturates and is forgotten."""
 
