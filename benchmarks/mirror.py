@@ -1,0 +1,105 @@
+"""How many bytes it takes to keep a copy of a map that grows: one update of a mirror after each scan, through a server.
+
+    python benchmarks/mirror.py DATASET [--max-range 25] [--mantissa-bits 7] [--every 1] [--json FILE]
+
+The server runs in this process, the client asks it over loopback. A fifth of each scan's beams is held out, so that the map is
+the one of the accuracy tables; at those points the mirror's answers are compared with the server's own.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+from rich.progress import track
+
+from potclient import MapClient
+from potclient.datasets import open_dataset
+from potclient.holdout import HoldOut
+from potserver.config import Settings
+from potserver.server import MapServer
+from potserver.services.settings import MappingSettings
+
+_COMPARED = 20_000  # points at most
+_TIMEOUT_S = 120.0
+
+
+def main() -> int:
+    options = _options()
+    recording = open_dataset(options.dataset, min_range_m=options.min_range, max_range_m=options.max_range)
+    settings = dataclasses.replace(Settings(), mapping=MappingSettings(max_range_m=options.max_range))
+    hold_out, held, updates = HoldOut(), [], []
+    with (
+        MapServer(settings, listen="tcp/127.0.0.1:0") as server,
+        MapClient(server.endpoint, timeout_s=_TIMEOUT_S) as client,
+    ):
+        mirror = client.mirror(mantissa_bits=options.mantissa_bits)
+        numbers = range(0, len(recording), options.every)
+        for k in track(numbers, description=options.dataset, console=Console(stderr=True)):
+            scan, labels = hold_out.split(recording[k], k)
+            held.append(labels.points)
+            client.integrate(scan.to_send, scan.T_map_sensor, is_return=scan.is_return)
+            started = time.perf_counter()
+            update = mirror.update()
+            updates.append((update.n_bytes, update.n_kernels, (time.perf_counter() - started) * 1e3))
+        at_once = client.mirror(mantissa_bits=options.mantissa_bits).update()
+        points = np.concatenate(held)
+        points = points[np.random.default_rng(0).permutation(len(points))[:_COMPARED]]
+        off = np.abs(mirror.occupancy(points).mean - client.occupancy(points).mean)
+        found = {
+            "scans": len(updates),
+            "kernels": len(mirror.kernels),
+            "bytes_at_once": at_once.n_bytes,
+            "update_bytes": [n for n, _, _ in updates],
+            "update_kernels": [n for _, n, _ in updates],
+            "update_ms": [ms for _, _, ms in updates],
+            "largest_difference": float(off.max()),
+            "mean_difference": float(off.mean()),
+        }
+    _print(found, options)
+    if options.json:
+        Path(options.json).write_text(json.dumps(found, indent=1) + "\n")
+    return 0
+
+
+def _options() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("dataset", metavar="DATASET")
+    parser.add_argument("--min-range", type=float, default=0.0, metavar="M")
+    parser.add_argument("--max-range", type=float, default=25.0, metavar="M")
+    parser.add_argument("--every", type=int, default=1, help="take every so many scans [1]")
+    parser.add_argument(
+        "--mantissa-bits", type=int, metavar="N", help="of the weights, 2 to 23 (default: all)"
+    )
+    parser.add_argument("--json", metavar="FILE", help="write the numbers")
+    return parser.parse_args()
+
+
+def _print(found: dict, options: argparse.Namespace) -> None:
+    size, took = np.array(found["update_bytes"]), np.array(found["update_ms"])
+    kernels, at_once = found["kernels"], found["bytes_at_once"]
+    bits = "all" if options.mantissa_bits is None else options.mantissa_bits
+    print(f"{options.dataset}: {found['scans']} scans, {kernels:,} kernels, {bits} bits of the weights")
+    print(
+        f"at once {at_once / 1e3:.0f} kB, {at_once / kernels:.1f} bytes a kernel ({40 * kernels / 1e3:.0f} kB plain)"
+    )
+    print(
+        f"an update: median {np.median(size) / 1e3:.0f} kB [{size.min() / 1e3:.0f}-{size.max() / 1e3:.0f}],"
+        f" {np.median(took):.0f} ms [{took.min():.0f}-{took.max():.0f}]"
+    )
+    print(
+        f"the mirror's probabilities are off by {found['largest_difference']:.2g} at most,"
+        f" {found['mean_difference']:.2g} on average"
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(main())
