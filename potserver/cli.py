@@ -131,8 +131,8 @@ Make a *.map file. In the folder `saved` of a server's store, `potclient map loa
 
   *.bt        a binary OctoMap: its voxels become evidence of a robot named after the file, and kernels are solved
               on it
-  *.npz       kernels, as `potclient export npz` writes them: they answer as they did, but there is no evidence;
-              only profile `paper` goes on from them
+  *.npz       kernels, as `potclient export npz` writes them. There is no evidence with them, so only servers of profile
+              `paper` load them; they answer by their own mapping.mean_moderation and mapping.residual_var
   DIR, *.map  the last snapshot of a map's folder, or a saved map, written anew"""
 
 _MAP_IMPORT_EXAMPLES = """\

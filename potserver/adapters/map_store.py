@@ -357,7 +357,7 @@ class MapStore:
                 f"{path} has tiles of {r.grid[0]} m, and mapping.tile_size_m is {size_m}: set it to the map's",
                 reason="settings",
             )
-        if r.n_scans and r.keeps_evidence != self._keeps_evidence:
+        if r.n_tiles and r.keeps_evidence != self._keeps_evidence:
             kinds = ("kernels alone (profile `paper`)", "evidence")
             raise MapFileError(
                 f"{path} is a map of {kinds[r.keeps_evidence]}, this server makes maps of {kinds[self._keeps_evidence]}:"

@@ -339,6 +339,19 @@ def test_maps_without_evidence_are_kept_too(tmp_path: Path, open_map: OpenMap) -
     assert refused.value.reason == "settings"
 
 
+def test_imported_kernels_are_not_taken_for_a_map_of_evidence(tmp_path: Path, open_map: OpenMap) -> None:
+    """No scan is in them, as in an empty map, but the next scans would solve their weights away."""
+    paper = MappingService(settings=MappingSettings.of_profile("paper"), threads=1)
+    paper.integrate(make_scan(1))
+    state = dataclasses.replace(paper.state, n_scans=0)
+    write_map(tmp_path / "saved" / "kernels.map", state, Origin("default", False, {}))
+    ours = open_map(tmp_path)
+    before = ours.state
+    with pytest.raises(MapFileError, match="other profile"):
+        ours.load("kernels")
+    assert ours.state is before
+
+
 def test_a_map_of_other_tiles_is_refused_and_nothing_changes(tmp_path: Path, open_map: OpenMap) -> None:
     state = _other_state(tile_size_m=5.0)
     write_map(tmp_path / "saved" / "small.map", state, Origin("default", True, {}))
