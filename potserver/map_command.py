@@ -115,7 +115,7 @@ def _described(path: Path) -> dict[str, Any]:
         "tiles": n_tiles,
         "kernels": table.n_kernels,
         "rows": table.n_rows,
-        "bytes": path.stat().st_size,
+        "bytes": _bytes_on_disk(path),
         "bytes of tiles": table.n_bytes,
     }
     if r.grid is not None:
@@ -125,6 +125,12 @@ def _described(path: Path) -> dict[str, Any]:
     if path.name == TILES:
         lines["scans in the journal"] = scans_after(path.with_name(JOURNAL), r.number)
     return lines
+
+
+def _bytes_on_disk(path: Path) -> int:
+    """Of a file and of what SQLite keeps beside it until it is copied in: a store's newest tiles may be there alone."""
+    log = path.with_name(f"{path.name}-wal")
+    return path.stat().st_size + (log.stat().st_size if log.exists() else 0)
 
 
 # --- export -----------------------------------------------------------------------------------------------------------

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -91,6 +92,20 @@ def test_info_of_a_store_lists_its_maps_and_their_journals(tmp_path: Path, run: 
     assert code == 0
     told = [(each["map"], each.get("scans in the journal")) for each in json.loads(out)]
     assert told == [("ground", 1), ("roof", 2), ("roof", None)]
+
+
+def test_info_counts_the_log_of_a_store_that_was_killed(tmp_path: Path, run: Run) -> None:
+    service = MappingService(settings=SETTINGS, threads=1)
+    store = MapStore(tmp_path / "store", "site", keeps_evidence=True, health=Health(), fsync=False)
+    store.restore(service)
+    service.integrate(make_scan(1))
+    store.save(None, service, {})
+    shutil.copytree(tmp_path / "store", tmp_path / "killed")  # as a kill would leave it now
+    store.close()
+    code, out, _ = run("info", tmp_path / "killed", "--json")
+    assert code == 0
+    (told,) = json.loads(out)
+    assert told["bytes"] > told["bytes of tiles"] > 0
 
 
 def test_what_is_no_map_is_one_line_and_exit_code_two(tmp_path: Path, saved: Path, run: Run) -> None:
