@@ -19,7 +19,7 @@ import msgspec
 import numpy as np
 
 from potschemas import __version__
-from potserver.adapters.sqlite import Kind, connect, connect_read_only, reading, transaction
+from potserver.adapters.sqlite import Kind, after_damage, connect, connect_read_only, reading, transaction
 from potserver.adapters.tile_codec import DIGEST_BYTES, decode_tile, digest_of, encode_tile
 from potserver.domain.folders import sync_folder
 from potserver.domain.kernel_map import KernelMap
@@ -330,11 +330,7 @@ def _parse(path: Path, content: object) -> MapRecord:
 
 
 def _damaged(path: Path, what: str) -> MapFileError:
-    return MapFileError(
-        f"{path} is damaged: {what}. Move it and its folder away, start with an empty map, and load a saved copy"
-        " (`potclient map load NAME`) if there is one",
-        reason="damaged",
-    )
+    return MapFileError(f"{path} is damaged: {what}{after_damage(path)}", reason="damaged")
 
 
 def _digest_number(data: bytes) -> int:

@@ -98,7 +98,19 @@ def reading(path: Path) -> Iterator[None]:
             raise _in_use(path) from error
         if "unable to open" in str(error) or "readonly" in str(error):
             raise StorageError(f"cannot open {path}: {error}") from error
-        raise MapFileError(f"{path} is damaged, or no file of ours: {error}", reason="damaged") from error
+        raise MapFileError(
+            f"{path} is damaged, or no file of ours: {error}{after_damage(path)}", reason="damaged"
+        ) from error
+
+
+def after_damage(path: Path) -> str:
+    """What to do about a damaged file, to follow what is wrong with it."""
+    if path.suffix != ".sqlite":  # a file of its own: a saved map, or something else altogether
+        return ". Take another copy of it"
+    return (
+        ". Move it and its folder away, start with an empty map, and load a saved copy (`potclient map load NAME`) if there"
+        " is one"
+    )
 
 
 @contextlib.contextmanager

@@ -472,6 +472,18 @@ def test_a_file_of_something_else_is_refused(
         open_map(folder)
 
 
+@pytest.mark.parametrize("file", [TILES, JOURNAL, "kept.map"])
+def test_a_file_that_was_cut_off_is_refused_with_what_to_do(
+    crashed: tuple[Path, MapState], tmp_path: Path, file: str
+) -> None:
+    is_map = file.endswith(".map")
+    content = (crashed[0] / ("saved" if is_map else "default") / file).read_bytes()
+    (tmp_path / file).write_bytes(content[: len(content) // 2])
+    read: Callable[[Path], Any] = _scans_of if file == JOURNAL else read_map
+    with pytest.raises(MapFileError, match="Take another copy" if is_map else "Move it and its folder away"):
+        read(tmp_path / file)
+
+
 def test_a_journal_that_was_cut_off_costs_only_its_end(tmp_path: Path, open_map: OpenMap) -> None:
     ours = open_map(tmp_path / "store")
     states = [ours.state]
