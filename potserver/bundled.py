@@ -13,6 +13,7 @@ STREET = "street"  # two outdoor LiDAR scans, 0.5 m apart
 ROOMS = "rooms"  # twelve scans of a simulated indoor scene: four places, three headings
 PLAN = "plan"  # the rooms in 2D: beams that clear the floor, seen from above
 STREET_PLAN = "street-plan"  # the street in 2D: its nearly horizontal beams
+NAMES = (STREET, ROOMS, PLAN, STREET_PLAN)
 
 _ROOMS_MAX_RANGE_M = 8.0  # longer readings of that simulated sensor are beams without an echo
 

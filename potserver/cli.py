@@ -92,7 +92,7 @@ _ATOMS_BUILD_EXAMPLES = """\
 examples:
   potserver atoms build /data/kitti/00 --scans 0:1000:10 --licence "CC BY-NC-SA 3.0" -o kitti.atoms
   potserver atoms build town:terraces:1 town:suburb:2 --learner n_sectors=8 -o towns.atoms
-  potserver atoms build --recipe site.toml -o site.atoms      a recipe: see the README
+  potserver atoms build --recipe site.toml -o site.atoms      a recipe: see docs/dictionary.md
   potserver atoms build --recipe site.toml -o site.atoms --ray auto
                                                               on a Ray cluster, with recordings at the same paths"""
 
@@ -108,7 +108,8 @@ examples:
   potserver eval /data/kitti/00 --scans 20 --max-range 25
   potserver eval /data/kitti/00 --scans 20 --max-range 25 --peers octomap:0.1,octomap:0.2,bgk:0.2,grid
   potserver eval town:terraces:dynamic:7 --scans 25 --max-range 25 --ablations --json out/town.json
-  potserver eval town:suburb:7 --profile paper --set mapping.n_sectors=8"""
+  potserver eval town:suburb:7 --profile paper --set mapping.n_sectors=8
+  potserver eval bundled:rooms --peers grid"""
 
 
 _MAP_INFO = """\
@@ -600,7 +601,10 @@ def _add_build_flags(parser: argparse.ArgumentParser) -> None:
 
 def _add_eval_flags(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
-        "datasets", nargs="+", metavar="DATASET", help="recordings, as `potclient publish` takes them"
+        "datasets",
+        nargs="+",
+        metavar="DATASET",
+        help="recordings, as `potclient publish` takes them, or bundled:NAME (street, rooms, plan, street-plan)",
     )
     what = parser.add_argument_group("maps")
     what.add_argument("--profile", metavar="NAME", help="mapping profile [default]")

@@ -205,7 +205,8 @@ def open_recording(dataset: str, reader: Reader) -> Recording:
     try:
         return bundled.open_bundled(name)
     except KeyError:
-        raise DatasetError(f"no bundled recording {name!r}") from None
+        names = ", ".join(bundled.NAMES)
+        raise DatasetError(f"no bundled recording {name!r}; there are {names}") from None
 
 
 def _is_spec(dataset: str) -> bool:

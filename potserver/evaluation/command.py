@@ -18,11 +18,10 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from potclient.datasets import open_dataset
 from potclient.errors import DatasetError, UsageError
 from potclient.holdout import HoldOut
 from potschemas import __version__
-from potserver.atom_builder.recipe import RecordingRecipe, parse_recipe
+from potserver.atom_builder.recipe import Reader, RecordingRecipe, open_recording, parse_recipe
 from potserver.config import Settings
 from potserver.domain.dictionary import AtomDictionary
 from potserver.errors import SettingsError
@@ -70,7 +69,8 @@ def run(options: argparse.Namespace, settings: Settings) -> list[Evaluation]:
         try:
             evaluation = _evaluate(dataset, options, settings, dictionary, threads)
         except (DatasetError, UsageError) as error:
-            raise SettingsError(f"{dataset}: {error}") from error
+            told = str(error)
+            raise SettingsError(told if dataset in told else f"{dataset}: {told}") from error
         found.append(evaluation)
         _print(evaluation, console, settings.mapping)
     if options.json is not None:
@@ -111,14 +111,14 @@ def _evaluate(
     dictionary: AtomDictionary,
     threads: int,
 ) -> Evaluation:
-    recording = open_dataset(
-        dataset,
-        options.format,
+    reader = Reader(
+        format=options.format,
         frame=options.frame,
         no_return_m=options.no_return,
         min_range_m=options.min_range,
         max_range_m=options.max_range,
     )
+    recording = open_recording(dataset, reader)
     numbers = _asked_scans(dataset, options.scans).numbers(len(recording))
     maps: list[Mapper] = [
         ServiceMap(name, mapping, dictionary, threads=threads)

@@ -268,6 +268,22 @@ def test_tables_of_a_document_have_as_many_cells_as_heads() -> None:
     assert len(tables) == 6
 
 
+def test_bundled_recordings_are_measured_by_name(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["eval", "bundled:plan", "--scans", "1", "--thin", "4", "--threads", "1"]) == 0
+    assert "bundled:plan: 1 scans" in capsys.readouterr().out
+    assert cli.main(["eval", "bundled:plan", "--max-range", "5"]) == 2
+    assert "take no reader options" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("dataset", ["bundled:x", "/no/such/folder", "town:x"])
+def test_a_recording_that_is_not_there_is_named_once(
+    capsys: pytest.CaptureFixture[str], dataset: str
+) -> None:
+    assert cli.main(["eval", dataset]) == 2
+    error = capsys.readouterr().err.strip().splitlines()[-1]
+    assert error.count(dataset) == 1
+
+
 @pytest.mark.parametrize(
     ("flags", "message"),
     [
