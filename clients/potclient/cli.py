@@ -977,7 +977,6 @@ and rejected by the server with a reason + unknown. Robots drop what the server 
 exit status is 1 if a cloud has no known fate, or a question failed for another reason than overload.""",
         epilog="""examples:
   potclient load --robots 4 --hz 5 --planners 2 --seconds 10
-  potclient mirror                                follow the map by what changes
   potclient load --robots 8 --dataset town:downtown:dynamic
   potclient load --robots 32 --hz 10 --points 20000 --dataset kitti/00 --json load.json""",
     )
