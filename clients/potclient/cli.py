@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potclient.atoms import Atom
-from potclient.client import MapClient
+from potclient.client import CONTROL_TIMEOUT_S, MapClient
 from potclient.datasets import FORMATS, FRAMES, Recording, open_dataset
 from potclient.errors import (
     DatasetError,
@@ -1188,6 +1188,7 @@ def _add_map(commands: Any) -> None:
         commands,
         "map",
         _map,
+        timeout_s=CONTROL_TIMEOUT_S,
         help=f"the map as a whole: {', '.join(CONTROL_VERBS)}",
         description="""Have the server save its map, load or merge a saved one, forget a robot or everything, or finish its
 queue and take no more clouds. Each comes after all clouds that the server has taken before it.
@@ -1237,11 +1238,12 @@ def _map(arguments: argparse.Namespace) -> int:
         raise UsageError(f"map: {verb} takes no pose")
     with _client(arguments) as client:
         if verb == "forget":
-            reply = client.forget(name)
+            reply = client.forget(name, timeout_s=arguments.timeout)
         elif verb == "merge":
-            reply = client.merge(name, None if arguments.pose is None else pose_of(*arguments.pose))
+            pose = None if arguments.pose is None else pose_of(*arguments.pose)
+            reply = client.merge(name, pose, timeout_s=arguments.timeout)
         else:
-            reply = client.control(verb, name=name)
+            reply = client.control(verb, name=name, timeout_s=arguments.timeout)
     _say(f"{reply.verb}: {reply.message} (revision {reply.map_revision})")
     return EXIT_OK
 
@@ -1333,14 +1335,25 @@ def _town(arguments: argparse.Namespace) -> int:
 # --- shared --------------------------------------------------------------------------------------------------------
 
 
-def _command(commands: Any, name: str, run: Callable[[argparse.Namespace], int], **texts: str) -> Any:
+def _command(
+    commands: Any,
+    name: str,
+    run: Callable[[argparse.Namespace], int],
+    *,
+    timeout_s: float = 10.0,
+    **texts: str,
+) -> Any:
     parser = commands.add_parser(name, formatter_class=argparse.RawDescriptionHelpFormatter, **texts)
     parser.set_defaults(command=run)
     group = parser.add_argument_group("server")
     group.add_argument("--map", default="default", metavar="ID", help="id of the map (default: default)")
     group.add_argument("--root", default=DEFAULT_ROOT, help=f"root of all keys (default {DEFAULT_ROOT})")
     group.add_argument(
-        "--timeout", type=_positive, default=10.0, metavar="SECONDS", help="of one answer (default 10)"
+        "--timeout",
+        type=_positive,
+        default=timeout_s,
+        metavar="SECONDS",
+        help=f"of one answer (default {timeout_s:g})",
     )
     add_zenoh_arguments(parser)
     return parser

@@ -73,6 +73,7 @@ _CHUNKS_IN_FLIGHT = 4
 _MIRROR_MARGIN_M = 4.0  # kernels of the coarsest maps are 1 m apart, and say nothing any more at 2.5 m
 _CHUNK_RETRIES = 8
 _DIAGNOSIS_TIMEOUT_S = 0.5
+CONTROL_TIMEOUT_S = 300.0  # a merge of two large maps takes a minute, and nobody should ask for it twice
 # megabytes, that must not delay short questions and answers on the same link
 _BULK_LANES = {
     "integrate": zenoh.Priority.DATA_LOW,
@@ -904,7 +905,7 @@ class MapClient:
         Args:
             name: Of the saved map. It must not hold scans that are in the map already: they would count twice.
             T_map_saved: (4, 4) rigid, p_map = T_map_saved @ p_saved; the same frame by default.
-            timeout_s: For the answer; a large map takes some seconds.
+            timeout_s: For the answer, see `control`; a large map takes a minute.
         Raises:
             UnknownMapError, MapFileError, UnsupportedError, StorageError: as for `load`.
             BadPoseError: the transform is not rigid. The map is unchanged, as after any error.
@@ -937,11 +938,12 @@ class MapClient:
             name: Of a saved map, for `save`, `load` and `merge`.
             robot: Whose scans, for `forget`.
             T_map_saved: (4, 4), for `merge`.
-            timeout_s: For the answer.
+            timeout_s: For the answer, by default `CONTROL_TIMEOUT_S`. Work that has begun by then is done all the same.
         Raises:
             UnsupportedError: the server has no such verb.
+            QueryTimeoutError: the map may change nevertheless: look at it before you ask again.
         """
-        timeout_s = self._timeout_s if timeout_s is None else timeout_s
+        timeout_s = CONTROL_TIMEOUT_S if timeout_s is None else timeout_s
         key = self.keys.control(_legal_id(verb, "verb"))
         request = messages.ControlRequest(
             timeout_s=timeout_s,
@@ -949,7 +951,12 @@ class MapClient:
             robot=messages.ABSENT if robot is None else _legal_id(robot, "robot"),
             T_map_saved=messages.ABSENT if T_map_saved is None else encode_array(T_map_saved),
         )
-        sample = next(self._ask_key(key, request, timeout_s))
+        try:
+            sample = next(self._ask_key(key, request, timeout_s))
+        except QueryTimeoutError as error:
+            raise QueryTimeoutError(
+                f"{error}; the server may still do it: look at the map's revision before you ask again"
+            ) from error
         return _decode(sample.payload, messages.ControlReply)
 
     # --- streams -------------------------------------------------------------------------------------------------------------

@@ -574,7 +574,7 @@ class ControlRequest(Message, frozen=True, kw_only=True):
 
     schema: ClassVar[str] = "pot.control.v1"
 
-    timeout_s: Positive | None = None  # s, how long the work may take; absent = the server's default
+    timeout_s: Positive | None = None  # s, past which the work is not begun; absent = no limit
     name: Identifier | Absent = ABSENT  # of a saved map: what to `load` or `merge`, or to `save` a copy as
     robot: Identifier | Absent = ABSENT  # whose scans to `forget`
     T_map_saved: Array | Absent = ABSENT  # (4, 4) float64, rigid; `merge`: absent = the same frame

@@ -90,6 +90,7 @@ class FakeServer:
         self.poses: queue.Queue[messages.Pose] = queue.Queue()
         self.points = np.zeros((0, 3))
         self.saved: dict[str, Any] = {}
+        self.clears: list[messages.ControlRequest] = []
         self.revision = 0
         self.queries: list[str] = []
         self._held: list[zenoh.Query] = []
@@ -468,6 +469,7 @@ class FakeServer:
         self._publish(stats_key(self.keys.root, SERVER), self.stats())
 
     def _reply_ctl_clear(self, payload: bytes) -> list[messages.Message]:
+        self.clears.append(decode(payload, messages.ControlRequest))
         with self._lock:
             self.points = np.zeros((0, 3))
             self.revision += 1

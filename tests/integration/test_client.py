@@ -17,7 +17,7 @@ import zenoh
 
 from potclient import feed
 from potclient.atoms import Atom
-from potclient.client import MapClient, _query_qos
+from potclient.client import CONTROL_TIMEOUT_S, MapClient, _query_qos
 from potclient.datasets import open_dataset
 from potclient.errors import (
     AtomRefusedError,
@@ -534,6 +534,23 @@ def test_a_server_that_thinks_for_ever(server: FakeServer, client: MapClient) ->
     assert isinstance(caught.value, TimeoutError)
     with pytest.raises(QueryTimeoutError):
         client.info(timeout_s=0.1)
+
+
+def test_who_gave_up_on_a_change_of_the_map_is_told_that_it_may_come(
+    server: FakeServer, client: MapClient
+) -> None:
+    server.script.hold = {"ctl-merge"}
+    with pytest.raises(QueryTimeoutError, match="look at the map's revision before you ask again"):
+        client.merge("north", timeout_s=0.1)
+
+
+def test_changes_of_the_map_are_waited_for_longer_than_answers(server: FakeServer, client: MapClient) -> None:
+    """A merge that was given up on and asked for again would count twice."""
+    with MapClient(server.endpoint, timeout_s=0.5) as hasty:
+        hasty.control("clear")
+    assert server.clears[-1].timeout_s == CONTROL_TIMEOUT_S > 60.0
+    client.control("clear", timeout_s=2.0)
+    assert server.clears[-1].timeout_s == 2.0
 
 
 def test_a_server_that_is_killed_with_the_question_in_flight() -> None:
