@@ -67,7 +67,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return EXIT_FAILED
     except OSError as error:
-        return _complain(f"{error.filename or 'file'}: {error.strerror or error}", EXIT_FAILED)
+        named = error.filename is not None  # numpy names the file in the text alone
+        return _complain(f"{error.filename}: {error.strerror}" if named else str(error), EXIT_FAILED)
     except KeyboardInterrupt:
         return _complain("interrupted", EXIT_INTERRUPTED)
 

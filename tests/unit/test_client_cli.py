@@ -120,6 +120,16 @@ def test_wrong_usage_ends_with_status_2(words: list[str], capsys: pytest.Capture
     assert "Traceback" not in capsys.readouterr().err
 
 
+def test_a_file_that_is_not_there_is_named(
+    server: FakeServer, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    for suffix in ("txt", "npy"):
+        missing = str(tmp_path / f"none.{suffix}")
+        assert main(["query", "--file", missing, "-e", server.endpoint]) == 1
+        (line,) = capsys.readouterr().err.splitlines()
+        assert line.startswith(f"potclient: {missing}")
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [

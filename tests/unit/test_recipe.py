@@ -131,7 +131,7 @@ def test_a_recording_overrides_the_recipe() -> None:
 def test_opening(tmp_path: Path) -> None:
     assert len(open_recording("bundled:rooms", Reader())) == len(bundled.open_bundled("rooms"))
     assert len(open_recording("generated:2d", Reader(n_generated=7))) == 7
-    with pytest.raises(DatasetError, match="no bundled recording .*; there are street, rooms, plan"):
+    with pytest.raises(DatasetError, match=r"no bundled recording .*; there are street, rooms, plan"):
         open_recording("bundled:moon", Reader())
     with pytest.raises(DatasetError, match="no reader options"):
         open_recording("bundled:rooms", Reader(max_range_m=3.0))
