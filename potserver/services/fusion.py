@@ -193,8 +193,8 @@ def add_evidence(
 ) -> evidence.Rows:
     """Put labelled samples, (N, 3) m in the region's frame, into its rows; the rows that are new."""
     n_before = len(region.rows.occupied)
-    crowded = region.crowded(points, settings.crowded_share)
-    rows, gained = evidence.add(region.rows, points, occupied, weight, region.grid.fine_m, source, crowded)
+    added = evidence.add(region.rows, points, occupied, weight, region.grid.fine_m, source)
+    rows, gained = evidence.join_light(added, n_before, source, region.grid.fine_m)
     evidence.forget(rows.sums, gained, evidence.cells(rows), settings.memory)
     region.rows = rows
     return rows.take(slice(n_before, None))
