@@ -28,8 +28,11 @@ Bool = NDArray[np.bool_]
 
 _LEAST_WEIGHT = 1e-3  # a row with less says nothing
 _INSIDE = 0.5 - 1e-6  # voxels, from the centre
-_CLEAR = 2  # voxels around a free row that must be without hits for it to join another
-_LIGHT = 3.01  # looks: a new free row with more keeps its place
+_LIGHT = 1.01  # looks, thirds of which add up with rounding: a new row with more keeps its place
+_CLEAR = 1  # voxels without hits around a free row that may join any other beside it
+_WIDE_CLEAR = 3  # the same, for one that may join another two voxels away
+_WIDE_OUTWEIGHED = 3.0  # times that the other must weigh then
+_OUTWEIGHED = 25.0  # the same, for rows of hits and for free ones beside hits
 _MAX_PASSES = 5.0  # that one scan may hold against a row
 _WALK = 0.75  # step of a walk along a beam, in voxels of hits
 _SPANS = 8  # of beams; fixed, like all spans of work, though these only count
@@ -102,12 +105,16 @@ def add(
 
 
 def join_light(added: Added, n_before: int, source: int, fine_m: float) -> Added:
-    """Let new free rows of little weight share a row where space is clear: it has less to tell there.
+    """Let new rows that say little share a row with what is beside them: the weight stays, the place becomes a mean.
 
-    A new free row with no hits at or within two voxels of it, of one look at most, joins the nearest of the source's free rows
-    in the voxels beside it that weighs as much or more. That row takes its weight, and moves with the mean of all its samples
-    as far as its own voxel goes. What a single scan has looked at more often keeps its row: close to the sensor surfaces may
-    turn up later.
+    A new row of one look at most joins the nearest row of its label and source in the voxels around it, which takes its weight
+    and moves with the mean of all its samples as far as its own voxel goes. In clear space, without hits in the 27 voxels
+    there, the other need not be the lighter one; of hits, and of free rows beside hits, only what another outweighs 25 times
+    joins it. Where no hits are within three voxels and no row is beside, a row two voxels away will do, if it weighs three
+    times as much. Free rows in voxels with hits stay: they are what tells that something has left.
+
+    Looks are of one scan: a voxel that a scan has looked at more often keeps its row whatever is around, for close to the
+    sensor surfaces may turn up later.
 
     Args:
         added: Rows and what they gained, from `add`.
@@ -345,18 +352,28 @@ def _join_light(voxel, occupied, sums, sources, gained, first, source, fine_m, t
     for r in range(len(occupied)):
         if occupied[r]:
             n_hit_cells = _enter_hit(hit_table, hit_cells, n_hit_cells, voxel[r])
-        elif sources[r] == source:
-            keys[r] = pack(0, voxel[r, 0], voxel[r, 1], voxel[r, 2])
+        if sources[r] == source:
+            keys[r] = pack(occupied[r], voxel[r, 0], voxel[r, 1], voxel[r, 2])
             table[find(table, keys, keys[r])] = r
     for r in range(first, len(occupied)):
-        if occupied[r] or sums[r, 3] > _LIGHT:
-            continue
-        to = _nearest_beside(table, keys, voxel, sums, left, fine_m, r)
-        if to < 0 or _hits_near(hit_table, hit_cells, voxel[r]):
-            continue
         w = sums[r, 3]
+        if not 0.0 < w <= _LIGHT:
+            continue
+        label, edge = np.int64(occupied[r]), 0.5 * fine_m if occupied[r] else fine_m
+        if occupied[r]:
+            to = _nearest_around(table, keys, voxel, sums, left, edge, r, label, 1, _OUTWEIGHED * w)
+        elif _has_hits(hit_table, hit_cells, voxel[r], 0):
+            continue
+        elif _has_hits(hit_table, hit_cells, voxel[r], _CLEAR):
+            to = _nearest_around(table, keys, voxel, sums, left, edge, r, label, 1, _OUTWEIGHED * w)
+        else:
+            to = _nearest_around(table, keys, voxel, sums, left, edge, r, label, 1, w)
+            if to < 0 and not _has_hits(hit_table, hit_cells, voxel[r], _WIDE_CLEAR):
+                to = _nearest_around(table, keys, voxel, sums, left, edge, r, label, 2, _WIDE_OUTWEIGHED * w)
+        if to < 0:
+            continue
         for c in range(3):
-            sums[to, c] += sums[r, c] + w * (voxel[r, c] - voxel[to, c]) * fine_m
+            sums[to, c] += sums[r, c] + w * (voxel[r, c] - voxel[to, c]) * edge
         sums[to, 3] += w
         gained[to] += gained[r]
         left[r] = False
@@ -364,32 +381,32 @@ def _join_light(voxel, occupied, sums, sources, gained, first, source, fine_m, t
 
 
 @nb.njit(nogil=True, error_model="numpy", cache=True)
-def _nearest_beside(table, keys, voxel, sums, left, fine_m, r):
-    """Of the free rows in the 26 voxels around a row, the nearest that weighs as much at least; -1 if there is none."""
+def _nearest_around(table, keys, voxel, sums, left, edge, r, label, reach, least_weight):
+    """Of the other rows of a label within `reach` voxels of row r, the nearest of at least such weight; -1 if there is none."""
     nearest = np.int64(-1)
     least = np.inf
-    for dx in range(-1, 2):
-        for dy in range(-1, 2):
-            for dz in range(-1, 2):
-                key = pack(0, voxel[r, 0] + dx, voxel[r, 1] + dy, voxel[r, 2] + dz)
+    for dx in range(-reach, reach + 1):
+        for dy in range(-reach, reach + 1):
+            for dz in range(-reach, reach + 1):
+                key = pack(label, voxel[r, 0] + dx, voxel[r, 1] + dy, voxel[r, 2] + dz)
                 q = np.int64(table[find(table, keys, key)])
-                if q < 0 or q == r or not left[q] or sums[q, 3] < sums[r, 3]:
+                if q < 0 or q == r or not left[q] or sums[q, 3] < least_weight:
                     continue
                 d2 = 0.0
                 for c in range(3):
                     off = sums[q, c] / sums[q, 3] - sums[r, c] / sums[r, 3]
-                    d2 += ((voxel[q, c] - voxel[r, c]) * fine_m + off) ** 2
+                    d2 += ((voxel[q, c] - voxel[r, c]) * edge + off) ** 2
                 if d2 < least:
                     least, nearest = d2, q
     return nearest
 
 
 @nb.njit(nogil=True, error_model="numpy", cache=True)
-def _hits_near(hit_table, hit_cells, cell):
-    """Whether there are hits at a free voxel or within `_CLEAR` of it."""
-    for dx in range(-_CLEAR, _CLEAR + 1):
-        for dy in range(-_CLEAR, _CLEAR + 1):
-            for dz in range(-_CLEAR, _CLEAR + 1):
+def _has_hits(hit_table, hit_cells, cell, reach):
+    """Whether there are hits in a free voxel or within `reach` voxels of it."""
+    for dx in range(-reach, reach + 1):
+        for dy in range(-reach, reach + 1):
+            for dz in range(-reach, reach + 1):
                 key = pack(0, cell[0] + dx, cell[1] + dy, cell[2] + dz)
                 if hit_table[find(hit_table, hit_cells, key)] >= 0:
                     return True
