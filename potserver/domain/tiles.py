@@ -248,14 +248,6 @@ class Region:
         """(3,) m, map frame."""
         return np.asarray(self.lower, np.float64) * self.grid.size_m
 
-    def crowded(self, points: Float64, share: float) -> Bool:
-        """(N,) which points, (N, 3) m in this frame, lie in tiles with at least so many rows a voxel of free space."""
-        size = np.asarray(self.upper, np.int64) - np.asarray(self.lower, np.int64) + 1
-        row_tile, _ = tile_of(self.rows, self.grid.voxels, size)
-        counts = np.bincount(row_tile, minlength=int(size.prod()))
-        tile = np.clip(np.floor(points / self.grid.size_m), 0, size - 1).astype(np.int64)
-        return np.asarray(counts[_numbers(tile, size)] >= share * self.grid.voxels**3)
-
     def tiles(
         self, lower_m: Float64, upper_m: Float64, *, revision: int = 0, stamp_ns: int = 0
     ) -> dict[TileIndex, Tile]:

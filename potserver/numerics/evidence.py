@@ -28,6 +28,11 @@ Bool = NDArray[np.bool_]
 
 _LEAST_WEIGHT = 1e-3  # a row with less says nothing
 _INSIDE = 0.5 - 1e-6  # voxels, from the centre
+_LIGHT = 1.01  # looks, thirds of which add up with rounding: a new row with more keeps its place
+_CLEAR = 1  # voxels without hits around a free row that may join any other beside it
+_WIDE_CLEAR = 3  # the same, for one that may join another two voxels away
+_WIDE_OUTWEIGHED = 3.0  # times that the other must weigh then
+_OUTWEIGHED = 25.0  # the same, for rows of hits and for free ones beside hits
 _MAX_PASSES = 5.0  # that one scan may hold against a row
 _WALK = 0.75  # step of a walk along a beam, in voxels of hits
 _SPANS = 8  # of beams; fixed, like all spans of work, though these only count
@@ -72,7 +77,6 @@ def add(
     weight: Float64 | Float32,
     fine_m: float,
     source: int = 0,
-    crowded: Bool | None = None,
 ) -> Added:
     """Add a source's weighted samples to the rows; a negative weight takes samples off, down to nothing and no further.
 
@@ -83,8 +87,6 @@ def add(
         weight: (N,) of each sample.
         fine_m: The resolution.
         source: Who saw them; rows of others stay as they are.
-        crowded: (N,) where there are rows enough: a free sample in a new voxel there, with no hits at or beside it, counts
-            at the row of a voxel beside it, if there is one, and does not move that row's mean. Nowhere by default.
     """
     n_old, n = len(rows.occupied), len(points)
     voxel = np.empty((n_old + n, 3), np.int32)
@@ -96,10 +98,38 @@ def add(
     gained = np.zeros(n_old + n, np.float32)
     used = _add(
         voxel, label, sums, sources, gained, n_old, np.ascontiguousarray(points), occupied,
-        np.asarray(weight, np.float64), fine_m, source, np.zeros(n, bool) if crowded is None else crowded,
-        empty_table(n_old + n), empty_table(n_old + n),
+        np.asarray(weight, np.float64), fine_m, source,
+        empty_table(n_old + n),
     )  # fmt: skip
     return Added(Rows(voxel[:used], label[:used], sums[:used], sources[:used]), gained[:used])
+
+
+def join_light(added: Added, n_before: int, source: int, fine_m: float) -> Added:
+    """Let new rows that say little share a row with what is beside them: the weight stays, the place becomes a mean.
+
+    A new row of one look at most joins the nearest row of its label and source in the voxels around it, which takes its weight
+    and moves with the mean of all its samples as far as its own voxel goes. In clear space, without hits in the 27 voxels
+    there, the other need not be the lighter one; of hits, and of free rows beside hits, only what another outweighs 25 times
+    joins it. Where no hits are within three voxels and no row is beside, a row two voxels away will do, if it weighs three
+    times as much. Free rows in voxels with hits stay: they are what tells that something has left.
+
+    Looks are of one scan: a voxel that a scan has looked at more often keeps its row whatever is around, for close to the
+    sensor surfaces may turn up later.
+
+    Args:
+        added: Rows and what they gained, from `add`.
+        n_before: How many rows were there before: the rest are new.
+        source: Whose the new rows are.
+        fine_m: The resolution.
+    """
+    rows = Rows(*added.rows[:2], added.rows.sums.copy(), added.rows.source)
+    gained = added.weight.copy()
+    n = len(rows.occupied)
+    left = _join_light(
+        rows.voxel, rows.occupied, rows.sums, rows.source, gained, n_before, source, fine_m, empty_table(n),
+        empty_table(n),
+    )  # fmt: skip
+    return Added(rows.take(left), gained[left])
 
 
 def positions(rows: Rows, fine_m: float) -> Float64:
@@ -263,20 +293,13 @@ def _add(
     weight,
     fine_m,
     source,
-    crowded,
     table,
-    hit_table,
 ):
     keys = np.empty(len(label), np.int64)
-    hit_cells = np.empty(len(label), np.int64)  # free voxels with hits in them, of any source
-    n_hit_cells = 0
-    some_crowded = crowded.any()
     for r in range(n):
         if sources[r] == source:
             keys[r] = pack(label[r], voxel[r, 0], voxel[r, 1], voxel[r, 2])
             table[find(table, keys, keys[r])] = r
-        if some_crowded and label[r]:
-            n_hit_cells = _enter_hit(hit_table, hit_cells, n_hit_cells, voxel[r])
     cell = np.empty(3, np.int64)
     for i in range(len(points)):
         edge = 0.5 * fine_m if occupied[i] else fine_m
@@ -288,15 +311,6 @@ def _add(
         w = weight[i]
         if r < 0 and w <= 0.0:
             continue  # nothing to take off
-        if r < 0 and crowded[i] and not occupied[i]:
-            r = _row_beside(table, keys, hit_table, hit_cells, cell)
-            if r >= 0:
-                if sums[r, 3] > 0.0:
-                    for c in range(3):
-                        sums[r, c] *= 1.0 + w / sums[r, 3]
-                sums[r, 3] += w
-                gained[r] += w
-                continue
         if r < 0:
             r = n
             table[place] = r
@@ -305,8 +319,6 @@ def _add(
             for c in range(3):
                 voxel[r, c] = cell[c]
             n += 1
-            if some_crowded and occupied[i]:
-                n_hit_cells = _enter_hit(hit_table, hit_cells, n_hit_cells, voxel[r])
         if w < 0.0 and sums[r, 3] + w <= _LEAST_WEIGHT:
             gained[r] -= sums[r, 3]
             sums[r, :] = 0.0
@@ -331,18 +343,74 @@ def _enter_hit(hit_table, hit_cells, n, voxel):
 
 
 @nb.njit(nogil=True, error_model="numpy", cache=True)
-def _row_beside(table, keys, hit_table, hit_cells, cell):
-    """A free row of one of the 26 voxels around; -1 if there is none, or a hit among them."""
-    found = np.int64(-1)
-    for dx in range(-1, 2):
-        for dy in range(-1, 2):
-            for dz in range(-1, 2):
+def _join_light(voxel, occupied, sums, sources, gained, first, source, fine_m, table, hit_table):
+    """(R,) which rows are left."""
+    keys = np.empty(len(occupied), np.int64)
+    hit_cells = np.empty(len(occupied), np.int64)  # free voxels with hits in them, of any source
+    n_hit_cells = 0
+    left = np.ones(len(occupied), np.bool_)
+    for r in range(len(occupied)):
+        if occupied[r]:
+            n_hit_cells = _enter_hit(hit_table, hit_cells, n_hit_cells, voxel[r])
+        if sources[r] == source:
+            keys[r] = pack(occupied[r], voxel[r, 0], voxel[r, 1], voxel[r, 2])
+            table[find(table, keys, keys[r])] = r
+    for r in range(first, len(occupied)):
+        w = sums[r, 3]
+        if not 0.0 < w <= _LIGHT:
+            continue
+        label, edge = np.int64(occupied[r]), 0.5 * fine_m if occupied[r] else fine_m
+        if occupied[r]:
+            to = _nearest_around(table, keys, voxel, sums, left, edge, r, label, 1, _OUTWEIGHED * w)
+        elif _has_hits(hit_table, hit_cells, voxel[r], 0):
+            continue
+        elif _has_hits(hit_table, hit_cells, voxel[r], _CLEAR):
+            to = _nearest_around(table, keys, voxel, sums, left, edge, r, label, 1, _OUTWEIGHED * w)
+        else:
+            to = _nearest_around(table, keys, voxel, sums, left, edge, r, label, 1, w)
+            if to < 0 and not _has_hits(hit_table, hit_cells, voxel[r], _WIDE_CLEAR):
+                to = _nearest_around(table, keys, voxel, sums, left, edge, r, label, 2, _WIDE_OUTWEIGHED * w)
+        if to < 0:
+            continue
+        for c in range(3):
+            sums[to, c] += sums[r, c] + w * (voxel[r, c] - voxel[to, c]) * edge
+        sums[to, 3] += w
+        gained[to] += gained[r]
+        left[r] = False
+    return left
+
+
+@nb.njit(nogil=True, error_model="numpy", cache=True)
+def _nearest_around(table, keys, voxel, sums, left, edge, r, label, reach, least_weight):
+    """Of the other rows of a label within `reach` voxels of row r, the nearest of at least such weight; -1 if there is none."""
+    nearest = np.int64(-1)
+    least = np.inf
+    for dx in range(-reach, reach + 1):
+        for dy in range(-reach, reach + 1):
+            for dz in range(-reach, reach + 1):
+                key = pack(label, voxel[r, 0] + dx, voxel[r, 1] + dy, voxel[r, 2] + dz)
+                q = np.int64(table[find(table, keys, key)])
+                if q < 0 or q == r or not left[q] or sums[q, 3] < least_weight:
+                    continue
+                d2 = 0.0
+                for c in range(3):
+                    off = sums[q, c] / sums[q, 3] - sums[r, c] / sums[r, 3]
+                    d2 += ((voxel[q, c] - voxel[r, c]) * edge + off) ** 2
+                if d2 < least:
+                    least, nearest = d2, q
+    return nearest
+
+
+@nb.njit(nogil=True, error_model="numpy", cache=True)
+def _has_hits(hit_table, hit_cells, cell, reach):
+    """Whether there are hits in a free voxel or within `reach` voxels of it."""
+    for dx in range(-reach, reach + 1):
+        for dy in range(-reach, reach + 1):
+            for dz in range(-reach, reach + 1):
                 key = pack(0, cell[0] + dx, cell[1] + dy, cell[2] + dz)
                 if hit_table[find(hit_table, hit_cells, key)] >= 0:
-                    return np.int64(-1)
-                if found < 0:
-                    found = np.int64(table[find(table, keys, key)])
-    return found
+                    return True
+    return False
 
 
 @nb.njit(nogil=True, error_model="numpy", cache=True)

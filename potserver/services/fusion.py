@@ -38,6 +38,7 @@ _FINEST_M, _COARSEST_M, _FINE_PER_RANGE = 0.2, 0.4, 1.0 / 20.0
 _COARSE_REACH = 1.0  # spacings: nearer coarse nodes than this get a kernel, see lattice_nodes.new_nodes
 _FADE_EVERY = 2  # beams of which one is followed, for what it passes through
 _TOO_WIDE = 1.5  # coarse spacings
+_REACHED = 0.1  # activation by a carried kernel below which a point or a row is not its own
 _EXPLAINED = 1.0  # activation by carried kernels at which the lattice adds none
 _UNSUPPORTED = 1e-5  # of a kernel's curvature: what no row within its reach leaves
 _STALE = 0.125  # half-lives after which a tile that no scan touches is fitted again
@@ -117,10 +118,13 @@ def fuse(
             region.rows, beams.ends + start, beams.is_return, start, fine_m=grid.fine_m,
             rate=settings.fade_rate, gap_m=settings.gap_m, every=_FADE_EVERY, threads=threads,
         )  # fmt: skip
+    new_rows = add_evidence(region, points, labelled.occupied, beam_weights(labelled), source, settings)
     taken = KernelSet.empty()
     if settings.carry_into_map:
         taken = _wanted(carried.moved(-region.origin_m), region.kernels, points, grid, threads)
-    new_rows = add_evidence(region, points, labelled.occupied, beam_weights(labelled), source, settings)
+        # samples may count at a row that a narrow kernel does not reach: the solve would only drop it
+        where = evidence.positions(region.rows, grid.fine_m)
+        taken = taken.take(_support(taken, where, _REACHED, grid, threads) >= _REACHED)
     added = add_kernels(region, new_rows, MapKernels.new(taken, CARRIED), planar, settings, threads)
     fitted = _fit(region, lower - region.origin_m, upper - region.origin_m, settings, threads)
     return Fused(
@@ -193,8 +197,8 @@ def add_evidence(
 ) -> evidence.Rows:
     """Put labelled samples, (N, 3) m in the region's frame, into its rows; the rows that are new."""
     n_before = len(region.rows.occupied)
-    crowded = region.crowded(points, settings.crowded_share)
-    rows, gained = evidence.add(region.rows, points, occupied, weight, region.grid.fine_m, source, crowded)
+    added = evidence.add(region.rows, points, occupied, weight, region.grid.fine_m, source)
+    rows, gained = evidence.join_light(added, n_before, source, region.grid.fine_m)
     evidence.forget(rows.sums, gained, evidence.cells(rows), settings.memory)
     region.rows = rows
     return rows.take(slice(n_before, None))
@@ -246,12 +250,7 @@ def _wanted(
     carried = carried.take(carried.gamma >= gamma_of_spacing(_TOO_WIDE * grid.coarse_m))
     if len(carried) == 0:
         return carried
-    blocks = feature_blocks(
-        points, carried.hinge_mean, carried.gamma, edge_m=grid.coarse_m, cut=0.1, threads=threads
-    )
-    ones = np.ones(len(points), np.float32)
-    support, _ = gradient_and_diagonal(blocks, ones, ones, threads=threads)
-    carried = carried.take(support >= 1.0)
+    carried = carried.take(_support(carried, points, _REACHED, grid, threads) >= 1.0)
     before = present.kernels.take(present.level == CARRIED)
     explained = np.zeros(len(carried), bool)
     for fine in (False, True):
@@ -261,6 +260,15 @@ def _wanted(
             activation(same_scale, carried.hinge_mean[members], threads=threads) >= _EXPLAINED
         )
     return carried.take(~explained)
+
+
+def _support(kernels: KernelSet, points: Float64, cut: float, grid: TileGrid, threads: int) -> Float32:
+    """(K,) sum of phi over (N, 3) points, for each kernel."""
+    blocks = feature_blocks(
+        points, kernels.hinge_mean, kernels.gamma, edge_m=grid.coarse_m, cut=cut, threads=threads
+    )
+    ones = np.ones(len(points), np.float32)
+    return gradient_and_diagonal(blocks, ones, ones, threads=threads)[0]
 
 
 def _is_fine(kernels: KernelSet, grid: TileGrid) -> Bool:

@@ -92,9 +92,6 @@ class MappingSettings:
     half_life_s: float = (
         0.0  # in which evidence that nobody renews loses half its weight, by the scans' stamps; 0: never
     )
-    crowded_share: float = (
-        0.3  # rows a voxel of a tile, beyond which free samples far from hits make no rows of their own
-    )
     max_kernels_per_tile: int = 8_000
     carry_into_map: bool = False  # transported kernels join the overall map too, with their weights as prior
 
@@ -128,7 +125,7 @@ class MappingSettings:
             "rank_tolerance", "rank_iterations", "couple_points", "couple_reg", "couple_tolerance", "couple_iterations",
             "prior_var", "feature_cut", "instant_newton_steps", "instant_gradient_steps",
             "observed_activation", "tile_size_m", "match_beams",
-            "newton_steps", "gradient_steps", "cheap_values", "saturation", "memory", "max_kernels_per_tile", "crowded_share",
+            "newton_steps", "gradient_steps", "cheap_values", "saturation", "memory", "max_kernels_per_tile",
         ):  # fmt: skip
             self._need(name, getattr(self, name) > 0, "positive")
         self._need("rotations_deg", len(self.rotations_deg) > 0, "at least one angle")

@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from potserver.numerics.evidence import Rows, add, positions
+from potserver.numerics.evidence import Rows, add, join_light, positions
 
 FINE_M = 0.4
 
@@ -75,3 +75,44 @@ def test_rows_of_another_map_merge_as_weighted_points(seed: int, n: int, m: int)
     for key, sums in _as_dict(other).items():
         truth[key] = truth.get(key, np.zeros(4)) + sums
     _check_same(_as_dict(merged), truth)
+
+
+@given(seed=st.integers(0, 2**31), n=st.integers(1, 300), m=st.integers(1, 300))
+def test_joining_keeps_weights_means_and_what_tells_of_change(seed: int, n: int, m: int) -> None:
+    before, _ = add(Rows.empty(), *_samples(seed, n), FINE_M)
+    added = add(before, *_samples(seed + 1, m), FINE_M)
+    joined = join_light(added, len(before.occupied), 0, FINE_M)
+    rows, n_before = joined.rows, len(before.occupied)
+    np.testing.assert_array_equal(rows.voxel[:n_before], before.voxel)
+    np.testing.assert_allclose(joined.weight.sum(), added.weight.sum(), rtol=1e-4)
+    for label in (False, True):
+        moments = []
+        for some in (rows, added.rows):
+            mine = some.take(some.occupied == label)
+            edge = FINE_M / 2 if label else FINE_M
+            centre = (mine.voxel + 0.5) * edge
+            moments.append((mine.sums[:, :3] + mine.sums[:, 3:] * centre).sum(axis=0).tolist())
+            moments[-1].append(mine.sums[:, 3].sum())
+        np.testing.assert_allclose(moments[0], moments[1], atol=1e-3)
+    hit_voxels = {tuple(v) for v in (added.rows.voxel[added.rows.occupied] >> 1).tolist()}
+    assert _free_among(rows, hit_voxels) == _free_among(added.rows, hit_voxels)
+
+
+def _free_among(rows: Rows, hit_voxels: set[tuple]) -> set[tuple]:
+    """Voxels with free rows that have hits too."""
+    return hit_voxels & {tuple(v) for v in rows.voxel[~rows.occupied].tolist()}
+
+
+@given(seed=st.integers(0, 2**31), scans=st.integers(1, 30))
+def test_clear_space_that_is_covered_gets_no_more_rows(seed: int, scans: int) -> None:
+    """A row in every third voxel along each axis is beside all others: however long one looks, there are no more."""
+    rng = np.random.default_rng(seed)
+    every_third = np.stack(np.meshgrid(*[[1, 4, 7]] * 3), axis=-1).reshape(-1, 3)
+    n = len(every_third)
+    rows, _ = add(Rows.empty(), (every_third + 0.5) * FINE_M, np.zeros(n, bool), np.full(n, 2.0), FINE_M)
+    for _ in range(scans):
+        points = rng.uniform(0, 9 * FINE_M, (3, 3))
+        added = add(rows, points, np.zeros(3, bool), np.full(3, 1 / 3), FINE_M)
+        rows, _ = join_light(added, n, 0, FINE_M)
+        assert len(rows.occupied) == n
+    np.testing.assert_allclose(rows.sums[:, 3].sum(), 2.0 * n + scans, rtol=1e-4)

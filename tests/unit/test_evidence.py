@@ -5,7 +5,18 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from potserver.numerics.evidence import Rows, add, cells, counts, decay, fade, forget, is_alive, positions
+from potserver.numerics.evidence import (
+    Rows,
+    add,
+    cells,
+    counts,
+    decay,
+    fade,
+    forget,
+    is_alive,
+    join_light,
+    positions,
+)
 
 FINE_M = 0.4
 
@@ -131,31 +142,68 @@ def test_nothing_to_fade() -> None:
     )
 
 
-def test_where_rows_are_many_free_samples_count_at_a_row_beside_them() -> None:
-    rows = _rows([[0.1, 0.1, 0.1], [5.0, 5.0, 5.0]], [False, True])
-    points = np.array([[0.5, 0.1, 0.1], [0.1, 0.9, 0.1], [5.3, 5.0, 5.0], [0.5, 0.5, 0.5]])
-    occupied = np.array([False, False, False, True])
-    where = positions(rows, FINE_M)
-    spread, _ = add(rows, points, occupied, np.full(4, 0.5), FINE_M)
-    assert len(spread.occupied) == 6
-    crowded, gained = add(rows, points, occupied, np.full(4, 0.5), FINE_M, crowded=np.ones(4, bool))
-    # beside a free row; beyond its neighbours; beside a hit; a hit itself
-    assert len(crowded.occupied) == 5
-    np.testing.assert_allclose(crowded.sums[:2, 3], [1.5, 1.0])
-    np.testing.assert_allclose(positions(crowded, FINE_M)[:2], where, atol=1e-6)
-    assert gained.sum() == pytest.approx(2.0)
-    assert crowded.sums[:, 3].sum() == pytest.approx(spread.sums[:, 3].sum())
+def _joined(rows: Rows, point, occupied: bool, weight: float = 1 / 3, source: int = 0) -> Rows:
+    """The rows after one more sample, let join what is there."""
+    new = add(rows, np.array([point]), np.array([occupied]), np.array([weight]), FINE_M, source)
+    joined = join_light(new, len(rows.occupied), source, FINE_M)
+    assert joined.weight.sum() == pytest.approx(weight)
+    assert joined.rows.sums[:, 3].sum() == pytest.approx(rows.sums[:, 3].sum() + weight)
+    np.testing.assert_array_equal(joined.rows.voxel[: len(rows.occupied)], rows.voxel)
+    return joined.rows
 
 
-def test_rows_beside_new_hits_are_not_joined() -> None:
-    rows = _rows([[0.1, 0.1, 0.1]], False)
-    points, occupied = np.array([[0.5, 0.1, 0.1], [0.5, 0.5, 0.1]]), np.array([True, False])
-    joined, _ = add(rows, points, occupied, np.ones(2), FINE_M, crowded=np.ones(2, bool))
+def test_in_clear_space_a_light_row_joins_the_nearest_beside_it() -> None:
+    rows = _rows([[0.1, 0.1, 0.1], [0.9, 0.1, 0.1]], False)
+    before = rows.sums.copy()
+    joined = _joined(rows, [0.5, 0.1, 0.3], False)
+    assert len(joined.occupied) == 2
+    np.testing.assert_array_equal(rows.sums, before)  # what was given is not changed
+    nearest = int(np.argmax(joined.sums[:, 3]))
+    expected = (positions(rows, FINE_M)[nearest] + np.array([0.5, 0.1, 0.3]) / 3) / (4 / 3)
+    bounds = rows.voxel[nearest] * FINE_M, (rows.voxel[nearest] + 1) * FINE_M
+    np.testing.assert_allclose(positions(joined, FINE_M)[nearest], np.clip(expected, *bounds), atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("point", "weight"),
+    [([0.5, 0.1, 0.1], 1.5), ([1.3, 0.1, 0.1], 1 / 3), ([0.5, 0.1, 0.1], 1 / 3)],
+    ids=["of more than a look", "with nothing beside it", "beside a lighter one"],
+)
+def test_a_row_keeps_its_place(point: list[float], weight: float) -> None:
+    rows = _rows([[0.1, 0.1, 0.1]], False, np.array([2.0 if weight > 1 else 0.3]))
+    assert len(_joined(rows, point, False, weight).occupied) == 2
+
+
+@pytest.mark.parametrize(("times", "n_rows"), [(20.0, 3), (30.0, 2)])
+def test_beside_hits_a_free_row_joins_only_what_outweighs_it_far(times: float, n_rows: int) -> None:
+    rows = _rows([[0.1, 0.1, 0.1], [0.9, 0.1, 0.1]], [False, True], np.array([times / 3, 1.0]))
+    joined = _joined(rows, [0.5, 0.1, 0.1], False)
+    assert len(joined.occupied) == n_rows
+    np.testing.assert_array_equal(joined.sums[1], rows.sums[1])  # the hit is as it was
+
+
+def test_a_free_row_among_hits_stays_whatever_is_beside_it() -> None:
+    rows = _rows([[0.1, 0.1, 0.1], [0.5, 0.1, 0.1]], [False, True], np.array([100.0, 1.0]))
+    joined = _joined(rows, [0.7, 0.1, 0.1], False)
     assert len(joined.occupied) == 3
+    np.testing.assert_array_equal(joined.sums[:2], rows.sums)
 
 
-def test_rows_of_others_are_not_joined() -> None:
+@pytest.mark.parametrize(("times", "n_rows"), [(20.0, 2), (30.0, 1)])
+def test_a_hit_joins_only_what_outweighs_it_far(times: float, n_rows: int) -> None:
+    rows = _rows([[0.1, 0.1, 0.1]], True, np.array([times / 3]))
+    assert len(_joined(rows, [0.21, 0.1, 0.1], True).occupied) == n_rows
+
+
+@pytest.mark.parametrize(("times", "hit_x", "n_rows"), [(4.0, 9.0, 2), (2.0, 9.0, 3), (4.0, 2.1, 3)])
+def test_far_from_hits_a_row_two_voxels_away_will_do(times: float, hit_x: float, n_rows: int) -> None:
+    rows = _rows([[0.1, 0.1, 0.1], [hit_x, 0.1, 0.1]], [False, True], np.array([times / 3, 1.0]))
+    assert len(_joined(rows, [0.9, 0.1, 0.1], False).occupied) == n_rows
+
+
+def test_rows_of_other_sources_are_not_joined_and_their_hits_count() -> None:
     rows = _rows([[0.1, 0.1, 0.1]], False)
-    point = np.array([[0.5, 0.1, 0.1]])
-    other, _ = add(rows, point, np.array([False]), np.ones(1), FINE_M, 1, np.ones(1, bool))
+    other = _joined(rows, [0.5, 0.1, 0.1], False, source=1)
     np.testing.assert_array_equal(other.source, [0, 1])
+    hit = add(rows, np.array([[0.9, 0.1, 0.1]]), np.array([True]), np.ones(1), FINE_M, 1).rows
+    assert len(_joined(hit, [0.5, 0.1, 0.1], False).occupied) == 3

@@ -154,14 +154,3 @@ def test_new_kernels_have_their_weights_as_prior() -> None:
     assert len(MapKernels.concatenate([])) == 0
     with pytest.raises(ShapeError):
         dataclasses.replace(kernels, kernels=KernelSet.empty())
-
-
-def test_points_in_tiles_of_many_rows_are_crowded() -> None:
-    tiled = _map(FAR)
-    region = Region.of(tiled, np.array([-14.0, 3, -2]) + FAR, np.array([21.0, 18, 4]) + FAR)
-    points = np.random.default_rng(3).uniform([-14, 3, -2], [21, 18, 4], (300, 3)) + FAR
-    counts = np.array([len(tiled.tiles[GRID.index_of(p)].rows.occupied) for p in points])
-    limit = int(np.median(counts))
-    crowded = region.crowded(points - region.origin_m, limit / GRID.voxels**3)
-    np.testing.assert_array_equal(crowded, counts >= limit)
-    assert 0 < crowded.sum() < 300
