@@ -31,7 +31,7 @@ _INSIDE = 0.5 - 1e-6  # voxels, from the centre
 _BEHIND = 2.0  # resolutions that a beam goes on behind what it passes through; less is a graze, or noise
 _AROUND = 2  # voxels of hits to each side: where beams are counted that pass through a place
 _DOUBTED, _SURE = 2.0, 5.0  # beams more than voxels: the most that tell nothing, the least that tell all
-_FREE_A_HIT, _FREE_ALONE = 4.0, 100.0  # free weight for each hit and for each place, at a rate of 1
+_FREE_A_HIT, _FREE_ALONE = 2.0, 100.0  # free weight for each hit and for each place, at a rate of 1
 _OUTVOTED = 3.0  # free weight for the hits' in a cell, beyond which no more is put there
 _WALK = 0.75  # step of a walk along a beam, in voxels of hits
 _SPANS = 8  # of beams; fixed, like all spans of work, though these only count
@@ -222,7 +222,7 @@ def see_through(
     does so too, and one that grazes a surface passes through many. So a scan sees through a hit only if no hit of its own lies
     in the same or a touching voxel, and if the beams that pass through voxels of hits at and around it, a resolution to each
     side, outnumber these voxels. From 2 more to 5 more the scan's word grows from 0 to 1. At 1 the row is scaled by exp(-rate),
-    and free evidence of rate (4 weight + 100) comes where it stands, as long as its cell has less than three times the hits'.
+    and free evidence of rate (2 weight + 100) comes where it stands, as long as its cell has less than three times the hits'.
     So what was seen once goes no slower than what stood for long, and a place that was left stays in some doubt.
 
     Args:
