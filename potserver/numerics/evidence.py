@@ -5,7 +5,7 @@ centre. So it stands at their mean, rows of two maps add, and what was added can
 half the resolution, free samples in voxels of the resolution; each source, a robot, has rows of its own, so that it can be
 taken out. There are never more rows than voxels times sources, whatever is seen.
 
-All functions are pure but for `forget` and `fade`, which scale sums in place.
+All functions are pure but for `forget` and `see_through`, which scale sums in place.
 """
 
 from __future__ import annotations
@@ -33,7 +33,11 @@ _CLEAR = 1  # voxels without hits around a free row that may join any other besi
 _WIDE_CLEAR = 3  # the same, for one that may join another two voxels away
 _WIDE_OUTWEIGHED = 3.0  # times that the other must weigh then
 _OUTWEIGHED = 25.0  # the same, for rows of hits and for free ones beside hits
-_MAX_PASSES = 5.0  # that one scan may hold against a row
+_BEHIND = 2.0  # resolutions that a beam goes on behind what it passes through; less is a graze, or noise
+_AROUND = 2  # voxels of hits to each side: where beams are counted that pass through a place
+_DOUBTED, _SURE = 2.0, 5.0  # beams more than voxels: the most that tell nothing, the least that tell all
+_FREE_A_HIT, _FREE_ALONE = 2.0, 100.0  # free weight for each hit and for each place, at a rate of 1
+_OUTVOTED = 3.0  # free weight for the hits' in a cell, beyond which no more is put there
 _WALK = 0.75  # step of a walk along a beam, in voxels of hits
 _SPANS = 8  # of beams; fixed, like all spans of work, though these only count
 
@@ -218,7 +222,19 @@ def counts(sums: Float32, cells: Cells, saturation: float) -> Float32:
     return (weight / (1.0 + total[cells.number] / saturation)).astype(np.float32)
 
 
-def fade(
+class SeenThrough(NamedTuple):
+    """Free samples where hits stood that have left."""
+
+    points: Float64  # (P, 3) m, in the rows' frame
+    weight: Float64  # (P,)
+
+    @staticmethod
+    def nothing() -> SeenThrough:
+        """No samples."""
+        return SeenThrough(np.zeros((0, 3)), np.zeros(0))
+
+
+def see_through(
     rows: Rows,
     ends: Float64,
     is_return: Bool,
@@ -227,14 +243,17 @@ def fade(
     fine_m: float,
     rate: float,
     gap_m: float,
-    every: int = 1,
+    most_followed: int = 15_000,
     threads: int = 1,
-) -> int:
-    """Weaken hits that beams have passed through, in place: what stood there has left.
+) -> SeenThrough:
+    """Weaken hits that beams have passed through, in place, and say where free space is instead: what stood there has left.
 
-    A beam passes a row if it goes by within a quarter of the resolution and ends well behind it. Rows with a hit of this scan
-    in their own or a touching voxel are kept: along a slanted surface beams pass many places that others hit. A row that p
-    beams passed is scaled by exp(-rate min(p, 5)).
+    A beam passes through the voxels of hits on its way, up to well before its end. One that misses a pole, a wire or an edge
+    does so too, and one that grazes a surface passes through many. So a scan sees through a hit only if no hit of its own lies
+    in the same or a touching voxel, and if the beams that pass through voxels of hits at and around it, a resolution to each
+    side, outnumber these voxels. From 2 more to 5 more the scan's word grows from 0 to 1. At 1 the row is scaled by exp(-rate),
+    and free evidence of rate (2 weight + 100) comes where it stands, as long as its cell has less than three times the hits'.
+    So what was seen once goes no slower than what stood for long, and a place that was left stays in some doubt.
 
     Args:
         rows: The sums of hit rows are changed.
@@ -242,35 +261,48 @@ def fade(
         is_return: (B,) whether they are hits.
         origin: (3,) m, start of the beams in the rows' frame.
         fine_m: The resolution.
-        rate: Of the decay, for each beam.
+        rate: Of the decay, for each scan.
         gap_m: A beam says nothing about this much before its hit.
-        every: Of so many beams one is followed, and stands for all of them.
+        most_followed: Beams; of more, every second, third ... is followed, and stands for those left out.
         threads: Threads to spread the beams over.
     Returns:
-        Number of rows that were weakened.
+        Free samples to add, one a row that was weakened.
     """
-    hits = np.flatnonzero(rows.occupied)
+    hits = np.flatnonzero(rows.occupied & is_alive(rows))
     if len(hits) == 0 or len(ends) == 0:
-        return 0
+        return SeenThrough.nothing()
+    voxel = rows.voxel[hits]
     table = empty_table(len(hits))
-    keys, following = _enter_voxels(rows.voxel[hits], table)
-    where = positions(rows.take(hits), fine_m).astype(np.float32)
-    where[~is_alive(rows)[hits]] = np.inf  # nothing passes near a dead row
-
+    keys, following = _enter_voxels(voxel, table)
+    every = -(-len(ends) // most_followed)
     followed, returned = ends[::every], is_return[::every]
 
-    def run(span: tuple[int, int]) -> Int32:
+    def run(span: tuple[int, int]) -> tuple[Int32, Int32]:
         a, b = span
-        return _passes(followed[a:b], returned[a:b], origin, table, keys, following, where, fine_m, gap_m)
+        found, beam = _passes(followed[a:b], returned[a:b], origin, table, keys, fine_m, gap_m)
+        return found, beam + np.int32(a)
 
-    passes = np.sum(parallel_map(run, spans(len(followed), _SPANS), threads), axis=0)
-    passed = np.flatnonzero(passes)
+    parts = parallel_map(run, spans(len(followed), _SPANS), threads)
+    found, beam = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
+    passed = np.flatnonzero(np.bincount(found, minlength=len(hits)))
     new = np.floor(ends[is_return] / (0.5 * fine_m)).astype(np.int32)
-    passed = passed[_is_lonely(rows.voxel[hits[passed]], new, empty_table(len(new)))]
-    rows.sums[hits[passed]] *= np.exp(-rate * np.minimum(passes[passed] * every, _MAX_PASSES))[
-        :, None
-    ].astype(np.float32)
-    return len(passed)
+    passed = passed[_is_lonely(voxel[passed], new, empty_table(len(new)))]
+    slot = np.full(len(hits), -1, np.int32)
+    slot[passed] = np.arange(len(passed))
+    kept = np.flatnonzero(slot[found] >= 0)
+    kept = kept[np.argsort(found[kept], kind="stable")]
+    first = np.searchsorted(found[kept], np.append(passed, len(hits)))
+    excess = every * _excess(voxel[passed], first, beam[kept], slot, table, keys, len(followed))
+    word = np.clip((excess - _DOUBTED) / (_SURE - _DOUBTED), 0.0, 1.0)
+    place, member = _members(passed[word > 0], following)
+    gone = hits[member]
+    word = word[word > 0][place]
+    alone = _FREE_ALONE / np.bincount(place)[place]
+    weight = rate * word * (_FREE_A_HIT * rows.sums[gone, 3] + alone)
+    rows.sums[gone] *= np.exp(-rate * word)[:, None].astype(np.float32)
+    seen = rows.take(gone)
+    _bound(weight, seen.voxel, rows.voxel, rows.occupied, rows.sums[:, 3], empty_table(len(gone)))
+    return SeenThrough(positions(seen, fine_m), weight)
 
 
 def decay(rows: Rows, factor: float) -> Rows:
@@ -463,10 +495,11 @@ def _enter_voxels(voxel, table):
 
 
 @nb.njit(nogil=True, error_model="numpy", cache=True)
-def _passes(ends, is_return, origin, table, keys, following, where, fine_m, gap_m):
-    """(R,) how many of the beams pass each row, each beam counted once."""
-    n = np.zeros(len(keys), np.int32)
-    stamp = np.full(len(keys), -1, np.int32)
+def _passes(ends, is_return, origin, table, keys, fine_m, gap_m):
+    """(P,) voxels with hits that beams pass through, each as its last row, and (P,) the beams."""
+    found = np.empty(4096, np.int32)
+    beam = np.empty(4096, np.int32)
+    n = 0
     edge = 0.5 * fine_m
     for b in range(len(ends)):
         dx, dy, dz = ends[b, 0] - origin[0], ends[b, 1] - origin[1], ends[b, 2] - origin[2]
@@ -476,8 +509,7 @@ def _passes(ends, is_return, origin, table, keys, following, where, fine_m, gap_
         dx /= length
         dy /= length
         dz /= length
-        stop = length - gap_m if is_return[b] else length
-        behind = length - 2.5 * fine_m
+        stop = length - max(gap_m if is_return[b] else 0.0, _BEHIND * fine_m)
         s = 0.5 * _WALK * edge
         last = np.int64(-1)
         while s < stop:
@@ -491,17 +523,86 @@ def _passes(ends, is_return, origin, table, keys, following, where, fine_m, gap_
             if key == last:
                 continue
             last = key
-            r = np.int64(table[find(table, keys, key)])
-            while r >= 0:
-                if stamp[r] != b:
-                    px, py, pz = where[r, 0] - origin[0], where[r, 1] - origin[1], where[r, 2] - origin[2]
-                    along = px * dx + py * dy + pz * dz
-                    off2 = px * px + py * py + pz * pz - along * along
-                    if along < behind and off2 < 0.0625 * fine_m * fine_m:
-                        n[r] += 1
-                        stamp[r] = b
-                r = following[r]
-    return n
+            r = table[find(table, keys, key)]
+            if r < 0:
+                continue
+            if n == len(found):
+                found = np.append(found, np.empty_like(found))
+                beam = np.append(beam, np.empty_like(beam))
+            found[n] = r
+            beam[n] = b
+            n += 1
+    return found[:n].copy(), beam[:n].copy()
+
+
+@nb.njit(nogil=True, error_model="numpy", cache=True)
+def _excess(voxel, first, beam, slot, table, keys, n_beams):
+    """(V,) by how much the beams that pass through the voxels in and around each voxel outnumber those voxels."""
+    excess = np.zeros(len(voxel), np.int32)
+    stamp = np.full(n_beams, -1, np.int32)
+    for v in range(len(voxel)):
+        for dx in range(-_AROUND, _AROUND + 1):
+            for dy in range(-_AROUND, _AROUND + 1):
+                for dz in range(-_AROUND, _AROUND + 1):
+                    key = pack(1, voxel[v, 0] + dx, voxel[v, 1] + dy, voxel[v, 2] + dz)
+                    r = table[find(table, keys, key)]
+                    if r < 0 or slot[r] < 0:
+                        continue
+                    excess[v] -= 1
+                    for i in range(first[slot[r]], first[slot[r] + 1]):
+                        if stamp[beam[i]] != v:
+                            stamp[beam[i]] = v
+                            excess[v] += 1
+    return excess
+
+
+@nb.njit(nogil=True, error_model="numpy", cache=True)
+def _members(last, following):
+    """All rows of voxels that are given as their last rows: (M,) numbers of the voxels, (M,) rows."""
+    n = 0
+    for i in range(len(last)):
+        r = np.int64(last[i])
+        while r >= 0:
+            n += 1
+            r = following[r]
+    place = np.empty(n, np.int64)
+    member = np.empty(n, np.int64)
+    n = 0
+    for i in range(len(last)):
+        r = np.int64(last[i])
+        while r >= 0:
+            place[n] = i
+            member[n] = r
+            n += 1
+            r = following[r]
+    return place, member
+
+
+@nb.njit(nogil=True, error_model="numpy", cache=True)
+def _bound(weight, hit_voxel, voxel, occupied, row_weight, table):
+    """Scale new free weights at hits, in place, so that no cell's free weight grows beyond its bound."""
+    keys = np.empty(len(weight), np.int64)
+    cell = np.empty(len(weight), np.int64)
+    wanted = np.zeros(len(weight))
+    room = np.zeros(len(weight))
+    n = 0
+    for i in range(len(weight)):
+        key = pack(0, hit_voxel[i, 0] >> 1, hit_voxel[i, 1] >> 1, hit_voxel[i, 2] >> 1)
+        where = find(table, keys, key)
+        if table[where] < 0:
+            table[where] = n
+            keys[n] = key
+            n += 1
+        cell[i] = table[where]
+        wanted[cell[i]] += weight[i]
+    for r in range(len(voxel)):
+        shift = 1 if occupied[r] else 0
+        key = pack(0, voxel[r, 0] >> shift, voxel[r, 1] >> shift, voxel[r, 2] >> shift)
+        c = table[find(table, keys, key)]
+        if c >= 0:
+            room[c] += _OUTVOTED * row_weight[r] if occupied[r] else -row_weight[r]
+    for i in range(len(weight)):
+        weight[i] *= min(1.0, max(room[cell[i]], 0.0) / wanted[cell[i]])
 
 
 @nb.njit(nogil=True, error_model="numpy", cache=True)
@@ -513,12 +614,19 @@ def _is_lonely(voxel, new, table):
         place = find(table, keys, keys[i])
         if table[place] < 0:
             table[place] = i
-    lonely = np.ones(len(voxel), np.bool_)
+    lonely = np.empty(len(voxel), np.bool_)
     for i in range(len(voxel)):
-        for dx in range(-1, 2):
-            for dy in range(-1, 2):
-                for dz in range(-1, 2):
-                    key = pack(1, voxel[i, 0] + dx, voxel[i, 1] + dy, voxel[i, 2] + dz)
-                    if table[find(table, keys, key)] >= 0:
-                        lonely[i] = False
+        lonely[i] = not _is_beside(table, keys, voxel[i])
     return lonely
+
+
+@nb.njit(nogil=True, error_model="numpy", cache=True)
+def _is_beside(table, keys, voxel):
+    """Whether a voxel of hits or one that touches it has an entry."""
+    for dx in range(-1, 2):
+        for dy in range(-1, 2):
+            for dz in range(-1, 2):
+                key = pack(1, voxel[0] + dx, voxel[1] + dy, voxel[2] + dz)
+                if table[find(table, keys, key)] >= 0:
+                    return True
+    return False

@@ -36,7 +36,6 @@ from potserver.services.settings import MappingSettings
 
 _FINEST_M, _COARSEST_M, _FINE_PER_RANGE = 0.2, 0.4, 1.0 / 20.0
 _COARSE_REACH = 1.0  # spacings: nearer coarse nodes than this get a kernel, see lattice_nodes.new_nodes
-_FADE_EVERY = 2  # beams of which one is followed, for what it passes through
 _TOO_WIDE = 1.5  # coarse spacings
 _REACHED = 0.1  # activation by a carried kernel below which a point or a row is not its own
 _EXPLAINED = 1.0  # activation by carried kernels at which the lattice adds none
@@ -111,14 +110,18 @@ def fuse(
     lower, upper = bounds(labelled.points)
     lower, upper = lower - pad, upper + pad
     region = Region.of(tiled, lower - 4 * pad, upper + 4 * pad, moment.weight_of)
-    points = labelled.points - region.origin_m
+    points, occupied, weight = labelled.points - region.origin_m, labelled.occupied, beam_weights(labelled)
+    samples = points
     if settings.fade_rate:
         start = origin - region.origin_m
-        evidence.fade(
+        seen = evidence.see_through(
             region.rows, beams.ends + start, beams.is_return, start, fine_m=grid.fine_m,
-            rate=settings.fade_rate, gap_m=settings.gap_m, every=_FADE_EVERY, threads=threads,
+            rate=settings.fade_rate, gap_m=settings.gap_m, threads=threads,
         )  # fmt: skip
-    new_rows = add_evidence(region, points, labelled.occupied, beam_weights(labelled), source, settings)
+        samples = np.concatenate([points, seen.points])
+        occupied = np.concatenate([occupied, np.zeros(len(seen.points), bool)])
+        weight = np.concatenate([weight, seen.weight])
+    new_rows = add_evidence(region, samples, occupied, weight, source, settings)
     taken = KernelSet.empty()
     if settings.carry_into_map:
         taken = _wanted(carried.moved(-region.origin_m), region.kernels, points, grid, threads)

@@ -109,7 +109,7 @@ def remove_robot(
 ) -> tuple[TiledMap, set[TileIndex]]:
     """The map without what one robot has seen, and the tiles that changed; places that nobody else saw are unknown again.
 
-    What the robot's beams made fade of others' hits does not come back.
+    What the robot's scans made fade of others' hits does not come back.
 
     Raises:
         UnknownRobotError: the map has nothing from this robot.

@@ -88,7 +88,7 @@ class MappingSettings:
     cheap_values: int = 60_000_000  # features that a solve may touch for more Newton steps
     saturation: float = 20.0  # looks at one place that count; further ones repeat them
     memory: float = 200.0  # looks that one place keeps; older ones give way
-    fade_rate: float = 0.05  # by which hits weaken with each beam that passes through them; 0: never
+    fade_rate: float = 0.05  # by which hits weaken with each scan that sees through them; 0: never
     half_life_s: float = (
         0.0  # in which evidence that nobody renews loses half its weight, by the scans' stamps; 0: never
     )
