@@ -16,6 +16,7 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from potserver.numerics.geometry import bounds
 from potserver.numerics.threads import parallel_map, spans
 from potserver.numerics.voxel_hash import empty_table, find, pack
 
@@ -39,6 +40,7 @@ _DOUBTED, _SURE = 2.0, 5.0  # beams more than voxels: the most that tell nothing
 _FREE_A_HIT, _FREE_ALONE = 2.0, 100.0  # free weight for each hit and for each place, at a rate of 1
 _OUTVOTED = 3.0  # free weight for the hits' in a cell, beyond which no more is put there
 _WALK = 0.75  # step of a walk along a beam, in voxels of hits
+_BLOCK_SHIFT, _MAX_BLOCKS = 1, 2**22  # blocks of 2^shift voxels of hits along an edge
 _SPANS = 8  # of beams; fixed, like all spans of work, though these only count
 
 
@@ -274,13 +276,22 @@ def see_through(
     voxel = rows.voxel[hits]
     table = empty_table(len(hits))
     keys, following = _enter_voxels(voxel, table)
+    corner, shift, is_near = _blocks_of(voxel)
     every = -(-len(ends) // most_followed)
     followed, returned = ends[::every], is_return[::every]
 
     def run(span: tuple[int, int]) -> tuple[Int32, Int32]:
         a, b = span
-        found, beam = _passes(followed[a:b], returned[a:b], origin, table, keys, fine_m, gap_m)
-        return found, beam + np.int32(a)
+        room = 4 * (b - a) + 1024
+        while True:
+            found, beam = np.empty(room, np.int32), np.empty(room, np.int32)
+            n = _passes(
+                followed[a:b], returned[a:b], origin, table, keys, corner, shift, is_near, fine_m, gap_m, found,
+                beam,
+            )  # fmt: skip
+            if n <= room:
+                return found[:n], beam[:n] + np.int32(a)
+            room = n
 
     parts = parallel_map(run, spans(len(followed), _SPANS), threads)
     found, beam = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
@@ -494,45 +505,62 @@ def _enter_voxels(voxel, table):
     return keys, following
 
 
+def _blocks_of(voxel: Int32) -> tuple[Int32, int, Bool]:
+    """Which blocks of 2^shift voxels have any of (V, 3) voxels: their lower corner, the shift, a flag for each block.
+
+    Most of a beam's way leads through blocks without hits, and a flag is found faster than a voxel.
+    """
+    corner, last = bounds(voxel)
+    shift = _BLOCK_SHIFT
+    while np.prod(((last - corner) >> shift).astype(np.float64) + 1.0) > _MAX_BLOCKS:
+        shift += 1
+    is_near = np.zeros(((last - corner) >> shift) + 1, bool)
+    is_near[tuple(((voxel - corner) >> shift).T)] = True
+    return corner, shift, is_near
+
+
 @nb.njit(nogil=True, error_model="numpy", cache=True)
-def _passes(ends, is_return, origin, table, keys, fine_m, gap_m):
-    """(P,) voxels with hits that beams pass through, each as its last row, and (P,) the beams."""
-    found = np.empty(4096, np.int32)
-    beam = np.empty(4096, np.int32)
+def _passes(ends, is_return, origin, table, keys, corner, shift, is_near, fine_m, gap_m, found, beam):
+    """How often beams pass through voxels with hits; as many of these as there is room for, each as its last row, and the beams.
+
+    Arrays that grew in here would be references that are counted in every step, and take three times as long.
+    """
     n = 0
     edge = 0.5 * fine_m
+    ox, oy, oz = origin[0] / edge, origin[1] / edge, origin[2] / edge  # from here on in voxels
     for b in range(len(ends)):
-        dx, dy, dz = ends[b, 0] - origin[0], ends[b, 1] - origin[1], ends[b, 2] - origin[2]
+        dx, dy, dz = ends[b, 0] / edge - ox, ends[b, 1] / edge - oy, ends[b, 2] / edge - oz
         length = np.sqrt(dx * dx + dy * dy + dz * dz)
         if length <= 0.0:
             continue
         dx /= length
         dy /= length
         dz /= length
-        stop = length - max(gap_m if is_return[b] else 0.0, _BEHIND * fine_m)
-        s = 0.5 * _WALK * edge
+        stop = length - max(gap_m if is_return[b] else 0.0, _BEHIND * fine_m) / edge
+        s = 0.5 * _WALK
         last = np.int64(-1)
         while s < stop:
-            key = pack(
-                1,
-                np.int64(np.floor((origin[0] + dx * s) / edge)),
-                np.int64(np.floor((origin[1] + dy * s) / edge)),
-                np.int64(np.floor((origin[2] + dz * s) / edge)),
-            )
-            s += _WALK * edge
+            x = np.int64(np.floor(ox + dx * s))
+            y = np.int64(np.floor(oy + dy * s))
+            z = np.int64(np.floor(oz + dz * s))
+            s += _WALK
+            i, j, k = (x - corner[0]) >> shift, (y - corner[1]) >> shift, (z - corner[2]) >> shift
+            if not (0 <= i < is_near.shape[0] and 0 <= j < is_near.shape[1] and 0 <= k < is_near.shape[2]):
+                continue
+            if not is_near[i, j, k]:
+                continue
+            key = pack(1, x, y, z)
             if key == last:
                 continue
             last = key
             r = table[find(table, keys, key)]
             if r < 0:
                 continue
-            if n == len(found):
-                found = np.append(found, np.empty_like(found))
-                beam = np.append(beam, np.empty_like(beam))
-            found[n] = r
-            beam[n] = b
+            if n < len(found):
+                found[n] = r
+                beam[n] = b
             n += 1
-    return found[:n].copy(), beam[:n].copy()
+    return n
 
 
 @nb.njit(nogil=True, error_model="numpy", cache=True)
