@@ -521,7 +521,7 @@ def _blocks_of(voxel: Int32) -> tuple[Int32, int, Bool]:
 
 @nb.njit(nogil=True, error_model="numpy", cache=True)
 def _passes(ends, is_return, origin, table, keys, corner, shift, is_near, fine_m, gap_m, found, beam):
-    """How often beams pass through voxels with hits; as many of these as there is room for, each as its last row, and the beams.
+    """How often beams pass through voxels with hits; as many as there is room for, each as its last row, and the beams.
 
     Arrays that grew in here would be references that are counted in every step, and take three times as long.
     """
