@@ -36,7 +36,7 @@ _WIDE_OUTWEIGHED = 3.0  # times that the other must weigh then
 _OUTWEIGHED = 25.0  # the same, for rows of hits and for free ones beside hits
 _BEHIND = 2.0  # resolutions that a beam goes on behind what it passes through; less is a graze, or noise
 _AROUND = 2  # voxels of hits to each side: where beams are counted that pass through a place
-_DOUBTED, _SURE = 2.0, 5.0  # beams more than voxels: the most that tell nothing, the least that tell all
+_DOUBTED, _SURE = 8.0, 20.0  # beams more than voxels: the most that tell nothing, the least that tell all
 _FREE_A_HIT, _FREE_ALONE = 2.0, 100.0  # free weight for each hit and for each place, at a rate of 1
 _OUTVOTED = 3.0  # free weight for the hits' in a cell, beyond which no more is put there
 _WALK = 0.75  # step of a walk along a beam, in voxels of hits
@@ -253,7 +253,7 @@ def see_through(
     A beam passes through the voxels of hits on its way, up to well before its end. One that misses a pole, a wire or an edge
     does so too, and one that grazes a surface passes through many. So a scan sees through a hit only if no hit of its own lies
     in the same or a touching voxel, and if the beams that pass through voxels of hits at and around it, a resolution to each
-    side, outnumber these voxels. From 2 more to 5 more the scan's word grows from 0 to 1. At 1 the row is scaled by exp(-rate),
+    side, outnumber these voxels. From 8 more to 20 more the scan's word grows from 0 to 1. At 1 the row is scaled by exp(-rate),
     and free evidence of rate (2 weight + 100) comes where it stands, as long as its cell has less than three times the hits'.
     So what was seen once goes no slower than what stood for long, and a place that was left stays in some doubt.
 
