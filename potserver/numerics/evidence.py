@@ -253,8 +253,8 @@ def see_through(
     A beam passes through the voxels of hits on its way, up to well before its end. One that misses a pole, a wire or an edge
     does so too, and one that grazes a surface passes through many. So a scan sees through a hit only if no hit of its own lies
     in the same or a touching voxel, and if the beams that pass through voxels of hits at and around it, a resolution to each
-    side, outnumber these voxels. From 8 more to 20 more the scan's word grows from 0 to 1. At 1 the row is scaled by exp(-rate),
-    and free evidence of rate (2 weight + 100) comes where it stands, as long as its cell has less than three times the hits'.
+    side, outnumber these voxels. From 8 more to 20 more its word grows from 0 to 1. At 1 the row is scaled by exp(-rate), and
+    free evidence of rate (2 weight + 100) comes where it stands, as long as its cell has less than three times the hits'.
     So what was seen once goes no slower than what stood for long, and a place that was left stays in some doubt.
 
     Args:

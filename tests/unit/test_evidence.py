@@ -106,7 +106,7 @@ def test_hits_that_beams_pass_through_fade_and_free_space_comes_in_their_place()
         [4.0, 1.0, 1.0, 0.5],
     )
     before, where = rows.sums.copy(), positions(rows, FINE_M)
-    seen = _see_through(rows, _fan(12), True)
+    seen = _see_through(rows, _fan(24), True)
     np.testing.assert_allclose(rows.sums[0], before[0] * np.exp(-0.1), rtol=1e-5)
     np.testing.assert_array_equal(rows.sums[1:], before[1:])  # beside the beams, at their ends, and free
     np.testing.assert_allclose(positions(rows, FINE_M), where, atol=1e-6)
@@ -127,7 +127,7 @@ def test_free_evidence_outvotes_the_hits_of_a_cell_and_grows_no_further(looks: i
     assert _see_through(rows, _fan(30), False, rate=0.05).weight.sum() == pytest.approx(0.0, abs=1e-6)
 
 
-@pytest.mark.parametrize("n", [1, 3])
+@pytest.mark.parametrize("n", [1, 3, 9])
 def test_a_few_beams_tell_nothing_of_what_they_pass(n: int) -> None:
     """They may have missed a pole or a wire."""
     rows = _rows([[3.0, 0.01, 0.01]], True)
@@ -141,7 +141,7 @@ def test_beams_that_graze_a_surface_leave_it() -> None:
     wall = np.stack([np.arange(2.0, 7.0, 0.1), np.full(50, 0.05), np.full(50, 0.05)], axis=1)
     rows = _rows(wall, True)
     assert len(_see_through(rows, _fan(4), True).weight) == 0
-    assert len(_see_through(rows.take(slice(3)), _fan(12), True).weight) == 3, (
+    assert len(_see_through(rows.take(slice(3)), _fan(24), True).weight) == 3, (
         "many that go through a little of it tell"
     )
 
@@ -149,8 +149,8 @@ def test_beams_that_graze_a_surface_leave_it() -> None:
 def test_beams_left_out_are_stood_for() -> None:
     one, two = _rows([[3.0, 0.01, 0.01]], True), _rows([[3.0, 0.01, 0.01]], True)
     ends = _fan(1)
-    all_of_them = _see_through(one, np.repeat(ends, 10, axis=0), False)
-    a_half = _see_through(two, np.repeat(ends, 10, axis=0), False, most_followed=5)
+    all_of_them = _see_through(one, np.repeat(ends, 40, axis=0), False)
+    a_half = _see_through(two, np.repeat(ends, 40, axis=0), False, most_followed=20)
     np.testing.assert_array_equal(one.sums, two.sums)
     np.testing.assert_array_equal(all_of_them.weight, a_half.weight)
 
@@ -164,8 +164,8 @@ def test_a_hit_beside_a_new_one_does_not_fade() -> None:
 def test_rows_of_all_robots_fade_and_share_the_free_evidence() -> None:
     rows = _rows([[3.0, 0.01, 0.01]], True, [10.0])
     both, _ = add(rows, np.array([[3.0, 0.01, 0.01]]), np.array([True]), np.full(1, 10.0), FINE_M, source=1)
-    alone = _see_through(rows, _fan(12), False, rate=0.01)
-    shared = _see_through(both, _fan(12), False, rate=0.01)
+    alone = _see_through(rows, _fan(24), False, rate=0.01)
+    shared = _see_through(both, _fan(24), False, rate=0.01)
     np.testing.assert_allclose(both.sums[:, 3], 10.0 * np.exp(-0.01), rtol=1e-5)
     assert alone.weight.sum() < shared.weight.sum() < 2.0 * alone.weight.sum()
 
