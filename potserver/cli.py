@@ -21,6 +21,7 @@ import zenoh
 from potclient import cli as client_cli
 from potclient.datasets import FORMATS, FRAMES
 from potschemas import __version__
+from potserver import bundled
 from potserver.adapters.log import configure_logging, get_logger
 from potserver.config import Settings, as_tree, load_settings, to_toml
 from potserver.errors import PotserverError, SettingsError
@@ -604,7 +605,7 @@ def _add_eval_flags(parser: argparse.ArgumentParser) -> None:
         "datasets",
         nargs="+",
         metavar="DATASET",
-        help="recordings, as `potclient publish` takes them, or bundled:NAME (street, rooms, plan, street-plan)",
+        help=f"recordings, as `potclient publish` takes them, or bundled:NAME ({', '.join(bundled.NAMES)})",
     )
     what = parser.add_argument_group("maps")
     what.add_argument("--profile", metavar="NAME", help="mapping profile [default]")

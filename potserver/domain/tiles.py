@@ -267,7 +267,7 @@ class Region:
         kernel_tile = np.clip(np.floor(hinge / self.grid.size_m), 0, size - 1).astype(np.int64)
         kernels = self.kernels.moved(np.asarray(-kernel_tile * self.grid.size_m, np.float64))
         row_members = _by_number(row_tile, int(size.prod()))
-        kernel_members = _by_number(_numbers(kernel_tile, size), int(size.prod()))
+        kernel_members = _by_number(np.ravel_multi_index(tuple(kernel_tile.T), tuple(size)), int(size.prod()))
         out = {}
         for number, shift in enumerate(itertools.product(*(range(s) for s in size))):
             index = (self.lower[0] + shift[0], self.lower[1] + shift[1], self.lower[2] + shift[2])
@@ -283,12 +283,7 @@ def _tile_edge(rows: Rows, grid: TileGrid) -> NDArray[np.int64]:
     return np.where(rows.occupied, 2 * grid.voxels, grid.voxels)[:, None]
 
 
-def _by_number(number: NDArray[np.int64], n: int) -> list[NDArray[np.intp]]:
+def _by_number(number: NDArray[np.intp], n: int) -> list[NDArray[np.intp]]:
     """For each of n numbers, where it stands, ascending."""
     counts = np.bincount(number, minlength=n)
     return np.split(np.argsort(number, kind="stable"), np.cumsum(counts)[:-1])
-
-
-def _numbers(tile: NDArray[np.integer], size: NDArray[np.int64]) -> NDArray[np.int64]:
-    """(N,) one number for each (N, 3) tile of a box."""
-    return np.asarray((tile[:, 0] * size[1] + tile[:, 1]) * size[2] + tile[:, 2], np.int64)

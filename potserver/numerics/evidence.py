@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from potserver.numerics.geometry import bounds
 from potserver.numerics.threads import parallel_map, spans
-from potserver.numerics.voxel_hash import empty_table, find, pack
+from potserver.numerics.voxel_hash import empty_table, enter, find, pack
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
@@ -104,8 +104,7 @@ def add(
     gained = np.zeros(n_old + n, np.float32)
     used = _add(
         voxel, label, sums, sources, gained, n_old, np.ascontiguousarray(points), occupied,
-        np.asarray(weight, np.float64), fine_m, source,
-        empty_table(n_old + n),
+        np.asarray(weight, np.float64), fine_m, source, empty_table(n_old + n),
     )  # fmt: skip
     return Added(Rows(voxel[:used], label[:used], sums[:used], sources[:used]), gained[:used])
 
@@ -128,7 +127,7 @@ def join_light(added: Added, n_before: int, source: int, fine_m: float) -> Added
         source: Whose the new rows are.
         fine_m: The resolution.
     """
-    rows = Rows(*added.rows[:2], added.rows.sums.copy(), added.rows.source)
+    rows = added.rows._replace(sums=added.rows.sums.copy())
     gained = added.weight.copy()
     n = len(rows.occupied)
     left = _join_light(
@@ -311,9 +310,12 @@ def see_through(
     alone = _FREE_ALONE / np.bincount(place)[place]
     weight = rate * word * (_FREE_A_HIT * rows.sums[gone, 3] + alone)
     rows.sums[gone] *= np.exp(-rate * word)[:, None].astype(np.float32)
-    seen = rows.take(gone)
-    _bound(weight, seen.voxel, rows.voxel, rows.occupied, rows.sums[:, 3], empty_table(len(gone)))
-    return SeenThrough(positions(seen, fine_m), weight)
+    # no cell's free weight may grow beyond its bound
+    number, n_cells = cells(rows)
+    room = np.bincount(number, np.where(rows.occupied, _OUTVOTED, -1.0) * rows.sums[:, 3], n_cells)
+    wanted = np.bincount(number[gone], weight, n_cells)
+    weight *= np.minimum(1.0, np.maximum(room[number[gone]], 0.0) / wanted[number[gone]])
+    return SeenThrough(positions(rows.take(gone), fine_m), weight)
 
 
 def decay(rows: Rows, factor: float) -> Rows:
@@ -324,20 +326,7 @@ def decay(rows: Rows, factor: float) -> Rows:
 
 
 @nb.njit(nogil=True, error_model="numpy", cache=True)
-def _add(
-    voxel,
-    label,
-    sums,
-    sources,
-    gained,
-    n,
-    points,
-    occupied,
-    weight,
-    fine_m,
-    source,
-    table,
-):
+def _add(voxel, label, sums, sources, gained, n, points, occupied, weight, fine_m, source, table):
     keys = np.empty(len(label), np.int64)
     for r in range(n):
         if sources[r] == source:
@@ -350,11 +339,10 @@ def _add(
             cell[c] = np.int64(np.floor(points[i, c] / edge))
         key = pack(occupied[i], cell[0], cell[1], cell[2])
         place = find(table, keys, key)
-        r = np.int64(table[place])
-        w = weight[i]
-        if r < 0 and w <= 0.0:
-            continue  # nothing to take off
+        r = table[place]
         if r < 0:
+            if weight[i] <= 0.0:
+                continue  # nothing to take off
             r = n
             table[place] = r
             keys[r] = key
@@ -362,6 +350,7 @@ def _add(
             for c in range(3):
                 voxel[r, c] = cell[c]
             n += 1
+        w = weight[i]
         if w < 0.0 and sums[r, 3] + w <= _LEAST_WEIGHT:
             gained[r] -= sums[r, 3]
             sums[r, :] = 0.0
@@ -374,18 +363,6 @@ def _add(
 
 
 @nb.njit(nogil=True, error_model="numpy", cache=True)
-def _enter_hit(hit_table, hit_cells, n, voxel):
-    """Note the free voxel that a hit's voxel lies in; how many there are now."""
-    key = pack(0, voxel[0] >> 1, voxel[1] >> 1, voxel[2] >> 1)
-    place = find(hit_table, hit_cells, key)
-    if hit_table[place] < 0:
-        hit_table[place] = n
-        hit_cells[n] = key
-        n += 1
-    return n
-
-
-@nb.njit(nogil=True, error_model="numpy", cache=True)
 def _join_light(voxel, occupied, sums, sources, gained, first, source, fine_m, table, hit_table):
     """(R,) which rows are left."""
     keys = np.empty(len(occupied), np.int64)
@@ -394,7 +371,8 @@ def _join_light(voxel, occupied, sums, sources, gained, first, source, fine_m, t
     left = np.ones(len(occupied), np.bool_)
     for r in range(len(occupied)):
         if occupied[r]:
-            n_hit_cells = _enter_hit(hit_table, hit_cells, n_hit_cells, voxel[r])
+            key = pack(0, voxel[r, 0] >> 1, voxel[r, 1] >> 1, voxel[r, 2] >> 1)
+            n_hit_cells = max(n_hit_cells, enter(hit_table, hit_cells, n_hit_cells, key) + 1)
         if sources[r] == source:
             keys[r] = pack(occupied[r], voxel[r, 0], voxel[r, 1], voxel[r, 2])
             table[find(table, keys, keys[r])] = r
@@ -405,13 +383,13 @@ def _join_light(voxel, occupied, sums, sources, gained, first, source, fine_m, t
         label, edge = np.int64(occupied[r]), 0.5 * fine_m if occupied[r] else fine_m
         if occupied[r]:
             to = _nearest_around(table, keys, voxel, sums, left, edge, r, label, 1, _OUTWEIGHED * w)
-        elif _has_hits(hit_table, hit_cells, voxel[r], 0):
+        elif _has_around(hit_table, hit_cells, 0, voxel[r], 0):
             continue
-        elif _has_hits(hit_table, hit_cells, voxel[r], _CLEAR):
+        elif _has_around(hit_table, hit_cells, 0, voxel[r], _CLEAR):
             to = _nearest_around(table, keys, voxel, sums, left, edge, r, label, 1, _OUTWEIGHED * w)
         else:
             to = _nearest_around(table, keys, voxel, sums, left, edge, r, label, 1, w)
-            if to < 0 and not _has_hits(hit_table, hit_cells, voxel[r], _WIDE_CLEAR):
+            if to < 0 and not _has_around(hit_table, hit_cells, 0, voxel[r], _WIDE_CLEAR):
                 to = _nearest_around(table, keys, voxel, sums, left, edge, r, label, 2, _WIDE_OUTWEIGHED * w)
         if to < 0:
             continue
@@ -445,13 +423,13 @@ def _nearest_around(table, keys, voxel, sums, left, edge, r, label, reach, least
 
 
 @nb.njit(nogil=True, error_model="numpy", cache=True)
-def _has_hits(hit_table, hit_cells, cell, reach):
-    """Whether there are hits in a free voxel or within `reach` voxels of it."""
+def _has_around(table, keys, kind, voxel, reach):
+    """Whether a voxel of a kind, or one within `reach` voxels of it, has an entry."""
     for dx in range(-reach, reach + 1):
         for dy in range(-reach, reach + 1):
             for dz in range(-reach, reach + 1):
-                key = pack(0, cell[0] + dx, cell[1] + dy, cell[2] + dz)
-                if hit_table[find(hit_table, hit_cells, key)] >= 0:
+                key = pack(kind, voxel[0] + dx, voxel[1] + dy, voxel[2] + dz)
+                if table[find(table, keys, key)] >= 0:
                     return True
     return False
 
@@ -465,12 +443,8 @@ def _cells(voxel, occupied, table):
     for r in range(n_rows):
         shift = 1 if occupied[r] else 0
         key = pack(0, voxel[r, 0] >> shift, voxel[r, 1] >> shift, voxel[r, 2] >> shift)
-        place = find(table, keys, key)
-        if table[place] < 0:
-            table[place] = n
-            keys[n] = key
-            n += 1
-        number[r] = table[place]
+        number[r] = enter(table, keys, n, key)
+        n = max(n, number[r] + 1)
     return number, n
 
 
@@ -607,33 +581,6 @@ def _members(last, following):
 
 
 @nb.njit(nogil=True, error_model="numpy", cache=True)
-def _bound(weight, hit_voxel, voxel, occupied, row_weight, table):
-    """Scale new free weights at hits, in place, so that no cell's free weight grows beyond its bound."""
-    keys = np.empty(len(weight), np.int64)
-    cell = np.empty(len(weight), np.int64)
-    wanted = np.zeros(len(weight))
-    room = np.zeros(len(weight))
-    n = 0
-    for i in range(len(weight)):
-        key = pack(0, hit_voxel[i, 0] >> 1, hit_voxel[i, 1] >> 1, hit_voxel[i, 2] >> 1)
-        where = find(table, keys, key)
-        if table[where] < 0:
-            table[where] = n
-            keys[n] = key
-            n += 1
-        cell[i] = table[where]
-        wanted[cell[i]] += weight[i]
-    for r in range(len(voxel)):
-        shift = 1 if occupied[r] else 0
-        key = pack(0, voxel[r, 0] >> shift, voxel[r, 1] >> shift, voxel[r, 2] >> shift)
-        c = table[find(table, keys, key)]
-        if c >= 0:
-            room[c] += _OUTVOTED * row_weight[r] if occupied[r] else -row_weight[r]
-    for i in range(len(weight)):
-        weight[i] *= min(1.0, max(room[cell[i]], 0.0) / wanted[cell[i]])
-
-
-@nb.njit(nogil=True, error_model="numpy", cache=True)
 def _is_lonely(voxel, new, table):
     """(V,) which voxels have no new voxel at or beside them."""
     keys = np.empty(len(new), np.int64)
@@ -644,17 +591,5 @@ def _is_lonely(voxel, new, table):
             table[place] = i
     lonely = np.empty(len(voxel), np.bool_)
     for i in range(len(voxel)):
-        lonely[i] = not _is_beside(table, keys, voxel[i])
+        lonely[i] = not _has_around(table, keys, 1, voxel[i], 1)
     return lonely
-
-
-@nb.njit(nogil=True, error_model="numpy", cache=True)
-def _is_beside(table, keys, voxel):
-    """Whether a voxel of hits or one that touches it has an entry."""
-    for dx in range(-1, 2):
-        for dy in range(-1, 2):
-            for dz in range(-1, 2):
-                key = pack(1, voxel[0] + dx, voxel[1] + dy, voxel[2] + dz)
-                if table[find(table, keys, key)] >= 0:
-                    return True
-    return False

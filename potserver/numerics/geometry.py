@@ -8,7 +8,7 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from potserver.numerics.voxel_hash import empty_table, find
+from potserver.numerics.voxel_hash import empty_table, enter
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
@@ -100,10 +100,7 @@ def _first_of_each(cell, lower, size, table):
     n = 0
     for i in range(len(cell)):
         key = ((cell[i, 2] - lower[2]) * size[1] + cell[i, 1] - lower[1]) * size[0] + cell[i, 0] - lower[0]
-        place = find(table, keys, key)
-        if table[place] < 0:
-            table[place] = n
-            keys[n] = key
+        if enter(table, keys, n, key) == n:
             picked[n] = i
             n += 1
     return picked[:n].copy()

@@ -23,7 +23,7 @@ from potserver.numerics.cubes import sort_into_cubes
 from potserver.numerics.fastexp import FAST, exp32
 from potserver.numerics.geometry import bounds, inside_box
 from potserver.numerics.threads import parallel_map, spans
-from potserver.numerics.voxel_hash import empty_table, find
+from potserver.numerics.voxel_hash import empty_table, enter
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
@@ -108,12 +108,8 @@ def _times_there(key, table):
     entry = np.empty(len(key), np.int64)
     n = 0
     for i in range(len(key)):
-        place = find(table, keys, key[i])
-        if table[place] < 0:
-            table[place] = n
-            keys[n] = key[i]
-            n += 1
-        entry[i] = table[place]
+        entry[i] = enter(table, keys, n, key[i])
+        n = max(n, entry[i] + 1)
         count[entry[i]] += 1
     return count[entry]
 
@@ -181,8 +177,8 @@ def build_index(
         keys=np.concatenate(keys) if keys else np.zeros(0, np.int64),
         tau=tau,
         median_reach_m=float(np.median(r)) if len(r) else 1.0,
-        lower=lower - r.max(initial=0.0),
-        upper=upper + r.max(initial=0.0),
+        lower=lower - top,
+        upper=upper + top,
     )
 
 

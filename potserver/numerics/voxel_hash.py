@@ -46,3 +46,13 @@ def find(table, keys, key):
     while table[place] >= 0 and keys[table[place]] != key:
         place = (place + 1) & mask
     return place
+
+
+@nb.njit(nogil=True, error_model="numpy", cache=True)
+def enter(table, keys, n, key):
+    """The number of the key's entry among n; n itself if the key is new, and entered by this."""
+    place = find(table, keys, key)
+    if table[place] < 0:
+        table[place] = n
+        keys[n] = key
+    return np.int64(table[place])

@@ -127,7 +127,7 @@ def fuse(
         taken = _wanted(carried.moved(-region.origin_m), region.kernels, points, grid, threads)
         # samples may count at a row that a narrow kernel does not reach: the solve would only drop it
         where = evidence.positions(region.rows, grid.fine_m)
-        taken = taken.take(_support(taken, where, _REACHED, grid, threads) >= _REACHED)
+        taken = taken.take(_support(taken, where, grid, threads) >= _REACHED)
     added = add_kernels(region, new_rows, MapKernels.new(taken, CARRIED), planar, settings, threads)
     fitted = _fit(region, lower - region.origin_m, upper - region.origin_m, settings, threads)
     return Fused(
@@ -253,7 +253,7 @@ def _wanted(
     carried = carried.take(carried.gamma >= gamma_of_spacing(_TOO_WIDE * grid.coarse_m))
     if len(carried) == 0:
         return carried
-    carried = carried.take(_support(carried, points, _REACHED, grid, threads) >= 1.0)
+    carried = carried.take(_support(carried, points, grid, threads) >= 1.0)
     before = present.kernels.take(present.level == CARRIED)
     explained = np.zeros(len(carried), bool)
     for fine in (False, True):
@@ -265,10 +265,10 @@ def _wanted(
     return carried.take(~explained)
 
 
-def _support(kernels: KernelSet, points: Float64, cut: float, grid: TileGrid, threads: int) -> Float32:
+def _support(kernels: KernelSet, points: Float64, grid: TileGrid, threads: int) -> Float32:
     """(K,) sum of phi over (N, 3) points, for each kernel."""
     blocks = feature_blocks(
-        points, kernels.hinge_mean, kernels.gamma, edge_m=grid.coarse_m, cut=cut, threads=threads
+        points, kernels.hinge_mean, kernels.gamma, edge_m=grid.coarse_m, cut=_REACHED, threads=threads
     )
     ones = np.ones(len(points), np.float32)
     return gradient_and_diagonal(blocks, ones, ones, threads=threads)[0]
