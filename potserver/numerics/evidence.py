@@ -29,11 +29,14 @@ Bool = NDArray[np.bool_]
 
 _LEAST_WEIGHT = 1e-3  # a row with less says nothing
 _INSIDE = 0.5 - 1e-6  # voxels, from the centre
-_LIGHT = 1.01  # looks, thirds of which add up with rounding: a new row with more keeps its place
+_LIGHT = 1.01  # looks, parts of which add up with rounding: a new row with more keeps its place
+_STILL_LIGHT = 3.0  # looks: an old row with more keeps its place
 _CLEAR = 1  # voxels without hits around a free row that may join any other beside it
 _WIDE_CLEAR = 3  # the same, for one that may join another two voxels away
 _WIDE_OUTWEIGHED = 3.0  # times that the other must weigh then
-_OUTWEIGHED = 25.0  # the same, for rows of hits and for free ones beside hits
+_OUTWEIGHED = 25.0  # the same, for rows of hits and for new free ones beside hits
+_STILL_OUTWEIGHED = 10.0  # the same, for old free rows
+_TURNS = 3  # scans in which each old row is looked at once
 _BEHIND = 2.0  # resolutions that a beam goes on behind what it passes through; less is a graze, or noise
 _AROUND = 2  # voxels of hits to each side: where beams are counted that pass through a place
 _DOUBTED, _SURE = 8.0, 20.0  # beams more than voxels: the most that tell nothing, the least that tell all
@@ -76,6 +79,14 @@ class Added(NamedTuple):
     weight: Float32  # (R,) what each row gained
 
 
+class Joined(NamedTuple):
+    """Rows after samples were added and light rows have joined others."""
+
+    rows: Rows  # those that are left of the old ones first, in their order
+    weight: Float32  # (R,) what each row gained, what it took over included
+    n_old: int
+
+
 def add(
     rows: Rows,
     points: Float64,
@@ -94,6 +105,62 @@ def add(
         fine_m: The resolution.
         source: Who saw them; rows of others stay as they are.
     """
+    return _with_samples(rows, points, occupied, weight, fine_m, source)[0]
+
+
+def add_sparing(
+    rows: Rows,
+    points: Float64,
+    occupied: Bool,
+    weight: Float64 | Float32,
+    fine_m: float,
+    source: int = 0,
+    *,
+    within: tuple[Float64, Float64] | None = None,
+    turn: int = 0,
+) -> Joined:
+    """Add samples as `add` does, and let rows that say little share one with what is beside them.
+
+    The weight stays, the place becomes a mean: a row that joins another gives it its weight, and the other moves with the mean
+    of all its samples as far as its own voxel goes. Rows join the nearest of their label and source in the voxels around.
+
+    New rows of one look at most: in clear space, without hits in the 27 voxels there, the other need not be the lighter one;
+    of hits, and of free rows beside hits, only what another outweighs 25 times joins it. Where no hits are within three voxels
+    and no row is beside, a row two voxels away will do, if it weighs three times as much. Looks are of one scan: a voxel that a
+    scan has looked at more often keeps its row whatever is around, for close to the sensor surfaces may turn up later.
+
+    Old rows of three looks at most join what has come to outweigh them, free rows 10 times and hits 25 times: they have proved
+    to be noise, and a place that is seen again and again gets no more rows for it.
+
+    Free rows in voxels with hits stay: they are what tells that something has left.
+
+    Args:
+        rows, points, occupied, weight, fine_m, source: As for `add`; they are not changed.
+        within: Corners of the box in which old rows may join others, m, in the rows' frame; None leaves old rows alone.
+        turn: Of the old rows a part is looked at, with the next number another one.
+    """
+    added, table, keys = _with_samples(rows, points, occupied, weight, fine_m, source)
+    n_before = len(rows.occupied)
+    left = np.ones(len(added.weight), bool)
+    # voxels of free space whose neighbours are in the box too
+    lower, upper = (np.zeros(3), np.zeros(3)) if within is None else within
+    first, last = np.floor(lower / fine_m).astype(np.int64) + 1, np.floor(upper / fine_m).astype(np.int64) - 1
+    _join_light(
+        *added.rows, added.weight, left, n_before, source, fine_m, first, last, turn % _TURNS, table, keys,
+        empty_table(len(keys)),
+    )  # fmt: skip
+    return Joined(added.rows.take(left), added.weight[left], int(left[:n_before].sum()))
+
+
+def _with_samples(
+    rows: Rows,
+    points: Float64,
+    occupied: Bool,
+    weight: Float64 | Float32,
+    fine_m: float,
+    source: int,
+) -> tuple[Added, Int32, Int64]:
+    """The new rows, and the hash table of the source's with its keys."""
     n_old, n = len(rows.occupied), len(points)
     voxel = np.empty((n_old + n, 3), np.int32)
     label = np.empty(n_old + n, bool)
@@ -102,39 +169,12 @@ def add(
     sources = np.full(n_old + n, source, np.int16)
     sources[:n_old] = rows.source
     gained = np.zeros(n_old + n, np.float32)
+    keys, table = np.empty(n_old + n, np.int64), empty_table(n_old + n)
     used = _add(
         voxel, label, sums, sources, gained, n_old, np.ascontiguousarray(points), occupied,
-        np.asarray(weight, np.float64), fine_m, source, empty_table(n_old + n),
+        np.asarray(weight, np.float64), fine_m, source, table, keys,
     )  # fmt: skip
-    return Added(Rows(voxel[:used], label[:used], sums[:used], sources[:used]), gained[:used])
-
-
-def join_light(added: Added, n_before: int, source: int, fine_m: float) -> Added:
-    """Let new rows that say little share a row with what is beside them: the weight stays, the place becomes a mean.
-
-    A new row of one look at most joins the nearest row of its label and source in the voxels around it, which takes its weight
-    and moves with the mean of all its samples as far as its own voxel goes. In clear space, without hits in the 27 voxels
-    there, the other need not be the lighter one; of hits, and of free rows beside hits, only what another outweighs 25 times
-    joins it. Where no hits are within three voxels and no row is beside, a row two voxels away will do, if it weighs three
-    times as much. Free rows in voxels with hits stay: they are what tells that something has left.
-
-    Looks are of one scan: a voxel that a scan has looked at more often keeps its row whatever is around, for close to the
-    sensor surfaces may turn up later.
-
-    Args:
-        added: Rows and what they gained, from `add`.
-        n_before: How many rows were there before: the rest are new.
-        source: Whose the new rows are.
-        fine_m: The resolution.
-    """
-    rows = added.rows._replace(sums=added.rows.sums.copy())
-    gained = added.weight.copy()
-    n = len(rows.occupied)
-    left = _join_light(
-        rows.voxel, rows.occupied, rows.sums, rows.source, gained, n_before, source, fine_m, empty_table(n),
-        empty_table(n),
-    )  # fmt: skip
-    return Added(rows.take(left), gained[left])
+    return Added(Rows(voxel[:used], label[:used], sums[:used], sources[:used]), gained[:used]), table, keys
 
 
 def positions(rows: Rows, fine_m: float) -> Float64:
@@ -326,8 +366,7 @@ def decay(rows: Rows, factor: float) -> Rows:
 
 
 @nb.njit(nogil=True, error_model="numpy", cache=True)
-def _add(voxel, label, sums, sources, gained, n, points, occupied, weight, fine_m, source, table):
-    keys = np.empty(len(label), np.int64)
+def _add(voxel, label, sums, sources, gained, n, points, occupied, weight, fine_m, source, table, keys):
     for r in range(n):
         if sources[r] == source:
             keys[r] = pack(label[r], voxel[r, 0], voxel[r, 1], voxel[r, 2])
@@ -363,28 +402,33 @@ def _add(voxel, label, sums, sources, gained, n, points, occupied, weight, fine_
 
 
 @nb.njit(nogil=True, error_model="numpy", cache=True)
-def _join_light(voxel, occupied, sums, sources, gained, first, source, fine_m, table, hit_table):
-    """(R,) which rows are left."""
-    keys = np.empty(len(occupied), np.int64)
+def _join_light(
+    voxel, occupied, sums, sources, gained, left, n_old, source, fine_m, first, last, turn, table, keys, hit_table
+):  # fmt: skip
+    """Join rows, in place; `left` says afterwards which are left. Old ones join in voxels from `first` to `last` alone."""
     hit_cells = np.empty(len(occupied), np.int64)  # free voxels with hits in them, of any source
     n_hit_cells = 0
-    left = np.ones(len(occupied), np.bool_)
     for r in range(len(occupied)):
         if occupied[r]:
             key = pack(0, voxel[r, 0] >> 1, voxel[r, 1] >> 1, voxel[r, 2] >> 1)
             n_hit_cells = max(n_hit_cells, enter(hit_table, hit_cells, n_hit_cells, key) + 1)
-        if sources[r] == source:
-            keys[r] = pack(occupied[r], voxel[r, 0], voxel[r, 1], voxel[r, 2])
-            table[find(table, keys, keys[r])] = r
-    for r in range(first, len(occupied)):
+    for r in range(len(occupied)):
         w = sums[r, 3]
-        if not 0.0 < w <= _LIGHT:
+        is_old = r < n_old
+        if not 0.0 < w <= (_STILL_LIGHT if is_old else _LIGHT):
             continue
+        if is_old:
+            if sources[r] != source or (voxel[r, 0] + 2 * voxel[r, 1] + 3 * voxel[r, 2]) % _TURNS != turn:
+                continue
+            if not _is_between(voxel[r], 1 if occupied[r] else 0, first, last):
+                continue
         label, edge = np.int64(occupied[r]), 0.5 * fine_m if occupied[r] else fine_m
         if occupied[r]:
             to = _nearest_around(table, keys, voxel, sums, left, edge, r, label, 1, _OUTWEIGHED * w)
         elif _has_around(hit_table, hit_cells, 0, voxel[r], 0):
             continue
+        elif is_old:
+            to = _nearest_around(table, keys, voxel, sums, left, edge, r, label, 1, _STILL_OUTWEIGHED * w)
         elif _has_around(hit_table, hit_cells, 0, voxel[r], _CLEAR):
             to = _nearest_around(table, keys, voxel, sums, left, edge, r, label, 1, _OUTWEIGHED * w)
         else:
@@ -398,7 +442,16 @@ def _join_light(voxel, occupied, sums, sources, gained, first, source, fine_m, t
         sums[to, 3] += w
         gained[to] += gained[r]
         left[r] = False
-    return left
+
+
+@nb.njit(nogil=True, error_model="numpy", cache=True)
+def _is_between(voxel, shift, first, last):
+    """Whether a voxel, 1 / 2^shift as long as one of free space, lies in a box of those."""
+    for c in range(3):
+        v = voxel[c] >> shift
+        if v < first[c] or v > last[c]:
+            return False
+    return True
 
 
 @nb.njit(nogil=True, error_model="numpy", cache=True)

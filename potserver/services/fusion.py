@@ -121,7 +121,10 @@ def fuse(
         samples = np.concatenate([points, seen.points])
         occupied = np.concatenate([occupied, np.zeros(len(seen.points), bool)])
         weight = np.concatenate([weight, seen.weight])
-    new_rows = add_evidence(region, samples, occupied, weight, source, settings)
+    inside = lower - region.origin_m, upper - region.origin_m  # of tiles that are stored again
+    new_rows = add_evidence(
+        region, samples, occupied, weight, source, settings, within=inside, turn=moment.revision
+    )
     taken = KernelSet.empty()
     if settings.carry_into_map:
         taken = _wanted(carried.moved(-region.origin_m), region.kernels, points, grid, threads)
@@ -129,7 +132,7 @@ def fuse(
         where = evidence.positions(region.rows, grid.fine_m)
         taken = taken.take(_support(taken, where, grid, threads) >= _REACHED)
     added = add_kernels(region, new_rows, MapKernels.new(taken, CARRIED), planar, settings, threads)
-    fitted = _fit(region, lower - region.origin_m, upper - region.origin_m, settings, threads)
+    fitted = _fit(region, *inside, settings, threads)
     return Fused(
         region.tiles(lower, upper, revision=moment.revision, stamp_ns=moment.stamp_ns),
         len(added), int((added.level == CARRIED).sum()), fitted,
@@ -197,14 +200,20 @@ def add_evidence(
     weight: Float64 | Float32,
     source: int,
     settings: MappingSettings,
+    *,
+    within: tuple[Float64, Float64] | None = None,
+    turn: int = 0,
 ) -> evidence.Rows:
-    """Put labelled samples, (N, 3) m in the region's frame, into its rows; the rows that are new."""
-    n_before = len(region.rows.occupied)
-    added = evidence.add(region.rows, points, occupied, weight, region.grid.fine_m, source)
-    rows, gained = evidence.join_light(added, n_before, source, region.grid.fine_m)
+    """Put labelled samples, (N, 3) m in the region's frame, into its rows; the rows that are new.
+
+    Within a box, old rows that say little join others: see `evidence.add_sparing`.
+    """
+    rows, gained, n_old = evidence.add_sparing(
+        region.rows, points, occupied, weight, region.grid.fine_m, source, within=within, turn=turn
+    )
     evidence.forget(rows.sums, gained, evidence.cells(rows), settings.memory)
     region.rows = rows
-    return rows.take(slice(n_before, None))
+    return rows.take(slice(n_old, None))
 
 
 def add_kernels(

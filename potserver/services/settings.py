@@ -28,7 +28,7 @@ class MappingSettings:
     # beams
     min_range_m: float = 0.3  # shorter beams hit the robot itself
     max_range_m: float = 25.0  # longer beams are free up to here, and end without an echo
-    free_per_beam: int = 3
+    free_per_beam: int = 5
     gap_m: float = 0.3  # between a hit and its last free point
     beams_per_scan: int = 30_000  # of a denser scan, that many are drawn
     match_beams: int = (
@@ -67,7 +67,7 @@ class MappingSettings:
 
     # refinement (RePOT)
     refine: bool = True
-    prior_var: float = 50.0  # log-odds^2, of kernels without a transported prior
+    prior_var: float = 100.0  # log-odds^2, of kernels without a transported prior
     borrowed_var_per_m2: float = (
         10.0  # log-odds^2 for each m^2 of squared distance between atom and sector, added to the
     )

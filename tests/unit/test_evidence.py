@@ -6,15 +6,16 @@ import numpy as np
 import pytest
 
 from potserver.numerics.evidence import (
+    _TURNS,
     Rows,
     SeenThrough,
     add,
+    add_sparing,
     cells,
     counts,
     decay,
     forget,
     is_alive,
-    join_light,
     positions,
     see_through,
 )
@@ -190,8 +191,8 @@ def test_nothing_to_see_through() -> None:
 
 def _joined(rows: Rows, point, occupied: bool, weight: float = 1 / 3, source: int = 0) -> Rows:
     """The rows after one more sample, let join what is there."""
-    new = add(rows, np.array([point]), np.array([occupied]), np.array([weight]), FINE_M, source)
-    joined = join_light(new, len(rows.occupied), source, FINE_M)
+    joined = add_sparing(rows, np.array([point]), np.array([occupied]), np.array([weight]), FINE_M, source)
+    assert joined.n_old == len(rows.occupied)
     assert joined.weight.sum() == pytest.approx(weight)
     assert joined.rows.sums[:, 3].sum() == pytest.approx(rows.sums[:, 3].sum() + weight)
     np.testing.assert_array_equal(joined.rows.voxel[: len(rows.occupied)], rows.voxel)
@@ -253,3 +254,67 @@ def test_rows_of_other_sources_are_not_joined_and_their_hits_count() -> None:
     np.testing.assert_array_equal(other.source, [0, 1])
     hit = add(rows, np.array([[0.9, 0.1, 0.1]]), np.array([True]), np.ones(1), FINE_M, 1).rows
     assert len(_joined(hit, [0.5, 0.1, 0.1], False).occupied) == 3
+
+
+_BOX = np.full(3, -4.0), np.full(3, 4.0)
+
+
+def _after_all_turns(rows: Rows, within=_BOX, source: int = 0) -> Rows:
+    """The rows after every old one has been looked at once, without anything new."""
+    none = np.zeros((0, 3)), np.zeros(0, bool), np.zeros(0)
+    for turn in range(_TURNS):
+        joined = add_sparing(rows, *none, FINE_M, source, within=within, turn=turn)
+        assert joined.n_old == len(joined.rows.occupied) == len(joined.weight)
+        assert joined.rows.sums[:, 3].sum() == pytest.approx(rows.sums[:, 3].sum())
+        rows = joined.rows
+    return rows
+
+
+@pytest.mark.parametrize(
+    ("occupied", "weight", "times", "n_rows"),
+    [
+        (False, 1.0, 9.0, 2),
+        (False, 1.0, 11.0, 1),
+        (False, 3.5, 50.0, 2),
+        (True, 1.0, 24.0, 2),
+        (True, 1.0, 26.0, 1),
+    ],
+    ids=["outweighed little", "outweighed", "of many looks", "a hit, outweighed little", "a hit, outweighed"],
+)
+def test_an_old_light_row_joins_what_has_come_to_outweigh_it(
+    occupied: bool, weight: float, times: float, n_rows: int
+) -> None:
+    x = 0.21 if occupied else 0.5
+    rows = _rows([[0.1, 0.1, 0.1], [x, 0.1, 0.1]], occupied, np.array([times * weight, weight]))
+    left = _after_all_turns(rows)
+    assert len(left.occupied) == n_rows
+    if n_rows == 1:
+        edge = FINE_M / 2 if occupied else FINE_M
+        mean_x = (times * 0.1 + x) / (times + 1)
+        assert positions(left, FINE_M)[0, 0] == pytest.approx(min(mean_x, edge), abs=1e-5)
+
+
+def test_an_old_light_row_stays_among_hits_outside_the_box_or_anothers() -> None:
+    among_hits = _rows(
+        [[0.1, 0.1, 0.1], [0.5, 0.1, 0.1], [0.7, 0.1, 0.1]], [False, False, True], [100.0, 1, 1]
+    )
+    assert len(_after_all_turns(among_hits).occupied) == 3
+    rows = _rows([[0.1, 0.1, 0.1], [0.5, 0.1, 0.1]], False, np.array([100.0, 1.0]))
+    assert len(_after_all_turns(rows).occupied) == 1
+    assert len(_after_all_turns(rows, None).occupied) == 2
+    assert len(_after_all_turns(rows, (np.full(3, -4.0), np.full(3, 0.79))).occupied) == 2
+    assert len(_after_all_turns(rows, source=1).occupied) == 2
+
+
+def test_each_turn_looks_at_another_part_of_the_old_rows() -> None:
+    light = np.stack(np.meshgrid(*[np.arange(-6, 6, 2) + 0.5] * 3), axis=-1).reshape(-1, 3) * FINE_M
+    heavy = light + np.array([FINE_M, 0, 0])
+    rows = _rows(np.concatenate([light, heavy]), False, np.repeat([1.0, 50.0], len(light)))
+    none = np.zeros((0, 3)), np.zeros(0, bool), np.zeros(0)
+    joined = [
+        len(rows.occupied)
+        - add_sparing(rows, *none, FINE_M, within=(np.full(3, -9.0), np.full(3, 9.0)), turn=turn).n_old
+        for turn in range(_TURNS)
+    ]
+    assert sum(joined) == len(light)
+    assert min(joined) > 0

