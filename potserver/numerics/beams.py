@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
@@ -49,20 +50,40 @@ def label_beams(
     Returns:
         Hits first, in beam order; then the free points, in beam order.
     """
-    hit = np.flatnonzero(beams.is_return)
     length = np.linalg.norm(beams.ends, axis=1)
     usable = np.where(beams.is_return, length - gap_m, length)
-    long_enough = np.flatnonzero(usable > 0)
-    fraction = (np.arange(free_per_beam) + rng.random((len(long_enough), free_per_beam))) / max(
-        free_per_beam, 1
-    )
-    fraction *= (usable[long_enough] / length[long_enough])[:, None]
-    free = (beams.ends[long_enough, None, :] * fraction[..., None]).reshape(-1, 3)
+    n_free = int((usable > 0).sum()) * free_per_beam
     return LabelledPoints(
-        np.concatenate([beams.ends[hit], free]),
-        np.concatenate([np.ones(len(hit), bool), np.zeros(len(free), bool)]),
-        np.concatenate([hit, np.repeat(long_enough, free_per_beam)]),
+        *_label(
+            beams.ends,
+            beams.is_return,
+            length,
+            usable,
+            rng.random(n_free),
+            free_per_beam,
+            int(beams.is_return.sum()),
+        )
     )
+
+
+@nb.njit(nogil=True, error_model="numpy", cache=True)
+def _label(ends, is_return, length, usable, where, free_per_beam, n_hits):
+    n = n_hits + len(where)
+    points, occupied, beam = np.empty((n, 3)), np.zeros(n, np.bool_), np.empty(n, np.int64)
+    hit, free = 0, 0
+    for b in range(len(ends)):
+        if is_return[b]:
+            points[hit], occupied[hit], beam[hit] = ends[b], True, b
+            hit += 1
+        if usable[b] > 0:
+            share = usable[b] / length[b]
+            for k in range(free_per_beam):
+                fraction = (k + where[free]) / free_per_beam * share
+                for c in range(3):
+                    points[n_hits + free, c] = ends[b, c] * fraction
+                beam[n_hits + free] = b
+                free += 1
+    return points, occupied, beam
 
 
 def beam_weights(labelled: LabelledPoints) -> Float64:

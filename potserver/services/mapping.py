@@ -30,7 +30,7 @@ from potserver.domain.types import (
 from potserver.errors import EmptyError, SettingsError, UnknownRobotError
 from potserver.numerics import evidence
 from potserver.numerics.beams import Beams, LabelledPoints, beam_weights, label_beams, limit_range
-from potserver.numerics.geometry import in_sector, rotation_z, sector_edges, yaw_of
+from potserver.numerics.geometry import bounds, in_sector, rotation_z, sector_edges, yaw_of
 from potserver.numerics.threads import default_threads, parallel_map, parallel_pair
 from potserver.services import map_edits
 from potserver.services.fusion import Fused, Moment, append, fuse, grid_for, refit, stalest_part
@@ -377,7 +377,7 @@ class MappingService:
     def _refine(self, kernels: KernelSet, labelled: LabelledPoints, voxel_m: float) -> Refined:
         """The instantaneous map: transported weights as prior, the scan's points as data, those of one voxel as one."""
         s = self.settings
-        corner = labelled.points.min(axis=0)
+        corner = bounds(labelled.points)[0]
         rows, _ = evidence.add(
             evidence.Rows.empty(),
             labelled.points - corner,
