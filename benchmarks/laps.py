@@ -186,6 +186,7 @@ def _verdict(laps: list[dict[str, Any]]) -> list[str]:
         ("kernels", 1, lambda lap: lap["kernels"]),
         ("kernels' bytes", 1, lambda lap: lap["kernel_bytes"]),
         ("evidence's bytes", 1, lambda lap: lap["evidence_bytes"]),
+        ("all bytes", 1, lambda lap: lap["kernel_bytes"] + lap["evidence_bytes"]),
         ("CPU ms/scan", 1, lambda lap: float(np.median(lap["cpu_ms"]))),
         ("NLL", 1, lambda lap: lap["nll"]),
         ("AUC", -1, lambda lap: lap["auc"]),

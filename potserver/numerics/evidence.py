@@ -83,7 +83,7 @@ class Joined(NamedTuple):
     """Rows after samples were added and light rows have joined others."""
 
     rows: Rows  # those that are left of the old ones first, in their order
-    weight: Float32  # (R,) what each row gained, what it took over included
+    weight: Float32  # (R,) what each row gained by the samples, those of rows that joined it included
     n_old: int
 
 
@@ -145,8 +145,9 @@ def add_sparing(
     # voxels of free space whose neighbours are in the box too
     lower, upper = (np.zeros(3), np.zeros(3)) if within is None else within
     first, last = np.floor(lower / fine_m).astype(np.int64) + 1, np.floor(upper / fine_m).astype(np.int64) - 1
+    part = (turn + turn // _TURNS) % _TURNS  # who has every second or third turn gets to all parts, too
     _join_light(
-        *added.rows, added.weight, left, n_before, source, fine_m, first, last, turn % _TURNS, table, keys,
+        *added.rows, added.weight, left, n_before, source, fine_m, first, last, part, table, keys,
         empty_table(len(keys)),
     )  # fmt: skip
     return Joined(added.rows.take(left), added.weight[left], int(left[:n_before].sum()))
@@ -403,7 +404,7 @@ def _add(voxel, label, sums, sources, gained, n, points, occupied, weight, fine_
 
 @nb.njit(nogil=True, error_model="numpy", cache=True)
 def _join_light(
-    voxel, occupied, sums, sources, gained, left, n_old, source, fine_m, first, last, turn, table, keys, hit_table
+    voxel, occupied, sums, sources, gained, left, n_old, source, fine_m, first, last, part, table, keys, hit_table
 ):  # fmt: skip
     """Join rows, in place; `left` says afterwards which are left. Old ones join in voxels from `first` to `last` alone."""
     hit_cells = np.empty(len(occupied), np.int64)  # free voxels with hits in them, of any source
@@ -418,7 +419,7 @@ def _join_light(
         if not 0.0 < w <= (_STILL_LIGHT if is_old else _LIGHT):
             continue
         if is_old:
-            if sources[r] != source or (voxel[r, 0] + 2 * voxel[r, 1] + 3 * voxel[r, 2]) % _TURNS != turn:
+            if sources[r] != source or (voxel[r, 0] + 2 * voxel[r, 1] + 3 * voxel[r, 2]) % _TURNS != part:
                 continue
             if not _is_between(voxel[r], 1 if occupied[r] else 0, first, last):
                 continue
