@@ -50,6 +50,7 @@ def warm_fit(
     n_newton: int = 2,
     n_conjugate_gradient: int = 4,
     least_curvature: float = 0.01,
+    longest_step: float = 1.0,
     threads: int = 1,
 ) -> WarmFit:
     """Improve the weights of K kernels on N labelled rows.
@@ -65,6 +66,8 @@ def warm_fit(
         n_newton: Newton steps at most.
         n_conjugate_gradient: Conjugate-gradient steps for each.
         least_curvature: Of a row that counts once, > 0.
+        longest_step: In Newton steps: a step that does is doubled up to this, as long as twice as far is better still. Where
+            labels part cleanly the weights have far to go, and Newton's steps are cautious; to try costs no product with Phi.
         threads: Threads for the products with the features.
     """
     y, c = labels[blocks.order], np.ascontiguousarray(counts[blocks.order], np.float32)
@@ -107,6 +110,11 @@ def warm_fit(
         else:
             converged = -slope <= _ENOUGH * max(1.0, abs(value))  # float32 has nothing left to gain
             break
+        while 1.0 <= size < longest_step:
+            farther = objective(change, step, 2.0 * size)
+            if farther >= trial:
+                break
+            size, trial = 2.0 * size, farther
         w = w + np.float32(size) * step
         f = f + np.float32(size) * change
         gain, value = value - trial, trial

@@ -39,6 +39,7 @@ _COARSE_REACH = 1.0  # spacings: nearer coarse nodes than this get a kernel, see
 _TOO_WIDE = 1.5  # coarse spacings
 _REACHED = 0.1  # activation by a carried kernel below which a point or a row is not its own
 _EXPLAINED = 1.0  # activation by carried kernels at which the lattice adds none
+_LONGEST_STEP = 4.0  # Newton steps
 _UNSUPPORTED = 1e-5  # of a kernel's curvature: what no row within its reach leaves
 _STALE = 0.125  # half-lives after which a tile that no scan touches is fitted again
 
@@ -331,7 +332,7 @@ def _fit(region: Region, lower: Float64, upper: Float64, settings: MappingSettin
         blocks, region.rows.occupied[rows], counts[rows], region.kernels.prior_mean[local],
         region.kernels.prior_var[local], kernels.weight_mean[local], free=free,
         n_newton=int(np.clip(cheap, settings.newton_steps, 3 * settings.newton_steps)),
-        n_conjugate_gradient=settings.gradient_steps, threads=threads,
+        n_conjugate_gradient=settings.gradient_steps, longest_step=_LONGEST_STEP, threads=threads,
     )  # fmt: skip
     if not (np.isfinite(fit.weights).all() and np.isfinite(fit.var).all()):
         raise SolverError(f"the weights of {len(local)} kernels on {len(rows)} rows came out NaN or infinite")

@@ -67,6 +67,31 @@ def test_many_steps_end_at_the_optimum(case) -> None:
     np.testing.assert_allclose(1 / fit.var, fit.support + 1 / var, rtol=1e-3)
 
 
+@pytest.mark.parametrize("longest", [2.0, 4.0, 64.0])
+def test_longer_steps_end_at_the_same_optimum(case, longest: float) -> None:
+    blocks, _, labels, counts, mean, var = case
+    fit = warm_fit(
+        blocks, labels, counts, mean, var, np.zeros(K, np.float32), n_newton=40, n_conjugate_gradient=60,
+        longest_step=longest,
+    )  # fmt: skip
+    assert fit.converged
+    assert fit.objective <= _objective(case, _optimum(case)) * (1 + 1e-4)
+    assert fit.objective == pytest.approx(_objective(case, fit.weights), rel=1e-4)
+
+
+def test_where_labels_part_cleanly_one_longer_step_goes_farther_than_two(case) -> None:
+    blocks, phi, _, counts, mean, _ = case
+    clean, wide = phi @ np.sin(np.arange(K)) > 0, np.full(K, 1e4, np.float32)
+
+    def after(n: int, longest: float) -> float:
+        return warm_fit(
+            blocks, clean, counts, mean, wide, np.zeros(K, np.float32), n_newton=n, n_conjugate_gradient=20,
+            longest_step=longest,
+        ).objective  # fmt: skip
+
+    assert after(1, 4.0) < after(2, 1.0) < after(1, 1.0)
+
+
 def test_few_steps_from_near_the_optimum_stay_there(case) -> None:
     blocks, _, labels, counts, mean, var = case
     best = _optimum(case).astype(np.float32)
