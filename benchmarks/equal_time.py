@@ -81,7 +81,7 @@ def _options() -> argparse.Namespace:
     )
     parser.add_argument("dataset", metavar="DATASET")
     parser.add_argument("--scans", default=":", metavar="FROM:TO:STEP")
-    parser.add_argument("--min-range", type=float, metavar="M")
+    parser.add_argument("--min-range", type=float, default=0.0, metavar="M")
     parser.add_argument("--max-range", type=float, metavar="M")
     parser.add_argument("--thin", type=int, default=1, metavar="N", help="take every Nth beam")
     parser.add_argument("--json", metavar="FILE", help="write the numbers")
