@@ -87,7 +87,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         + (
             ""
             if options.datasets
-            else "The built-in atoms were learned on the other beams of these same scans.\n"
+            else "The built-in atoms were learned in made-up towns, and some on other beams of the rooms.\n"
         )
         + "carried: kernels that the map took from transported atoms; placed: kernels added where those explain nothing;\n"
         "W2: root of the transport cost under the entropic plan, hits plus free points (never 0, the blur counts)."
