@@ -21,9 +21,9 @@ from rich.console import Console
 from rich.table import Table
 
 from potclient.holdout import HoldOut
-from potserver.atom_builder.recipe import Reader, open_recording, parse_recipe
+from potserver.atom_builder.recipe import Reader, open_recording
 from potserver.domain.dictionary import AtomDictionary
-from potserver.evaluation.command import variants
+from potserver.evaluation.command import asked_scans, variants
 from potserver.evaluation.mappers import ServiceMap
 from potserver.evaluation.protocol import evaluate
 from potserver.services.settings import MappingSettings
@@ -49,14 +49,14 @@ def main() -> int:
     console = Console(width=120)
     reader = Reader(min_range_m=options.min_range, max_range_m=options.max_range)
     recording = open_recording(options.dataset, reader)
-    scans = parse_recipe({"recordings": [{"dataset": options.dataset, "scans": options.scans}]}, "flags")
+    numbers = asked_scans(options.dataset, options.scans).numbers(len(recording))
     dictionary = AtomDictionary.builtin()
     maps, names = [], []
     for curve, steps, settings in _asked():
         names.append((curve, steps))
         maps.append(ServiceMap(f"{curve}, {steps}", settings, dictionary, threads=1))
     evaluation = evaluate(
-        options.dataset, recording, scans.recordings[0].numbers(len(recording)), maps,
+        options.dataset, recording, numbers, maps,
         hold_out=HoldOut(0.2), thin=options.thin, on_step=lambda step: print(step, file=sys.stderr),
     )  # fmt: skip
     points = [
@@ -80,7 +80,7 @@ def _options() -> argparse.Namespace:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("dataset", metavar="DATASET")
-    parser.add_argument("--scans", default=":", metavar="FROM:TO:STEP")
+    parser.add_argument("--scans", metavar="FROM:TO:STEP")
     parser.add_argument("--min-range", type=float, default=0.0, metavar="M")
     parser.add_argument("--max-range", type=float, metavar="M")
     parser.add_argument("--thin", type=int, default=1, metavar="N", help="take every Nth beam")

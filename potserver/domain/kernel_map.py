@@ -19,7 +19,7 @@ from potserver.numerics.threads import default_threads
 
 # A point whose kernels sum to less activation than this is unobserved: nothing near it was ever seen.
 OBSERVED_ACTIVATION = 0.05
-# Variance of the latent where nothing is known, log-odds^2: a standard deviation of 7, anything from sure to sure.
+# Variance of the latent where nothing is known, log-odds^2: a standard deviation of 10, anything from sure to sure.
 PRIOR_VAR = 100.0
 
 

@@ -119,7 +119,7 @@ def _evaluate(
         max_range_m=options.max_range,
     )
     recording = open_recording(dataset, reader)
-    numbers = _asked_scans(dataset, options.scans).numbers(len(recording))
+    numbers = asked_scans(dataset, options.scans).numbers(len(recording))
     maps: list[Mapper] = [
         ServiceMap(name, mapping, dictionary, threads=threads)
         for name, mapping in variants(settings.mapping, ablations=options.ablations).items()
@@ -137,7 +137,8 @@ def _evaluate(
         )
 
 
-def _asked_scans(dataset: str, text: str | None) -> RecordingRecipe:
+def asked_scans(dataset: str, text: str | None) -> RecordingRecipe:
+    """The recording with the scans that a flag asks for, all of them by default."""
     scans: int | str = ":" if text is None else int(text) if text.isdecimal() else text
     return parse_recipe({"recordings": [{"dataset": dataset, "scans": scans}]}, "flags").recordings[0]
 

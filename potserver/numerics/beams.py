@@ -53,21 +53,13 @@ def label_beams(
     length = np.linalg.norm(beams.ends, axis=1)
     usable = np.where(beams.is_return, length - gap_m, length)
     n_free = int((usable > 0).sum()) * free_per_beam
-    return LabelledPoints(
-        *_label(
-            beams.ends,
-            beams.is_return,
-            length,
-            usable,
-            rng.random(n_free),
-            free_per_beam,
-            int(beams.is_return.sum()),
-        )
-    )
+    where = rng.random(n_free)
+    return LabelledPoints(*_label(beams.ends, beams.is_return, length, usable, where, free_per_beam))
 
 
 @nb.njit(nogil=True, error_model="numpy", cache=True)
-def _label(ends, is_return, length, usable, where, free_per_beam, n_hits):
+def _label(ends, is_return, length, usable, where, free_per_beam):
+    n_hits = is_return.sum()
     n = n_hits + len(where)
     points, occupied, beam = np.empty((n, 3)), np.zeros(n, np.bool_), np.empty(n, np.int64)
     hit, free = 0, 0

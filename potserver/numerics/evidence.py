@@ -142,7 +142,7 @@ def add_sparing(
     added, table, keys = _with_samples(rows, points, occupied, weight, fine_m, source)
     n_before = len(rows.occupied)
     left = np.ones(len(added.weight), bool)
-    # voxels of free space whose neighbours are in the box too
+    # voxels of free space whose neighbours are in the box too: of an empty box none
     lower, upper = (np.zeros(3), np.zeros(3)) if within is None else within
     first, last = np.floor(lower / fine_m).astype(np.int64) + 1, np.floor(upper / fine_m).astype(np.int64) - 1
     part = (turn + turn // _TURNS) % _TURNS  # who has every second or third turn gets to all parts, too
@@ -345,6 +345,8 @@ def see_through(
     first = np.searchsorted(found[kept], np.append(passed, len(hits)))
     excess = every * _excess(voxel[passed], first, beam[kept], slot, table, keys, len(followed))
     word = np.clip((excess - _DOUBTED) / (_SURE - _DOUBTED), 0.0, 1.0)
+    if not word.any():
+        return SeenThrough.nothing()
     place, member = _members(passed[word > 0], following)
     gone = hits[member]
     word = word[word > 0][place]

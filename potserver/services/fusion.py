@@ -294,7 +294,7 @@ def _fits_budget(present: Float64, added: Float64, grid: TileGrid, limit: int) -
     tile = np.floor(np.concatenate([present, added]) / grid.size_m).astype(np.int64)
     tile -= tile.min(axis=0, initial=0)
     size = tile.max(axis=0, initial=0) + 1
-    number = (tile[:, 0] * size[1] + tile[:, 1]) * size[2] + tile[:, 2]
+    number = np.ravel_multi_index(tuple(tile.T), tuple(size))
     order = np.argsort(number, kind="stable")
     first = np.searchsorted(number[order], number[order])
     place = np.empty(len(number), np.int64)

@@ -6,6 +6,7 @@ import dataclasses
 import math
 from enum import Enum
 
+from potserver.domain.kernel_map import OBSERVED_ACTIVATION, PRIOR_VAR
 from potserver.errors import SettingsError
 from potserver.numerics.displacement import OutOfSample
 
@@ -67,7 +68,7 @@ class MappingSettings:
 
     # refinement (RePOT)
     refine: bool = True
-    prior_var: float = 100.0  # log-odds^2, of kernels without a transported prior
+    prior_var: float = PRIOR_VAR  # log-odds^2, of kernels without a transported prior
     borrowed_var_per_m2: float = (
         10.0  # log-odds^2 for each m^2 of squared distance between atom and sector, added to the
     )
@@ -96,7 +97,7 @@ class MappingSettings:
     carry_into_map: bool = False  # transported kernels join the overall map too, with their weights as prior
 
     # answers
-    observed_activation: float = 0.05  # with less around it, a point is unobserved
+    observed_activation: float = OBSERVED_ACTIVATION  # with less around it, a point is unobserved
     residual_var: float = 50.0  # log-odds^2, see KernelMap; 0 is the paper's model
     mean_moderation: float = (
         0.05  # share of the latent variance that pulls means towards 0.5, see KernelMap; 1 is the paper's
