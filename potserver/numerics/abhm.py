@@ -510,14 +510,16 @@ def _tensor(array: Float64) -> torch.Tensor:
 # The inner loops get slices, so that the compiler makes SIMD code of them; see feature_blocks.py.
 @nb.njit(nogil=True, fastmath=FAST, error_model="numpy", cache=True)
 def _forward(x, y, z, hx, hy, hz, g, w, phi, d2):
-    f = np.float32(0)
     for i in range(len(phi)):
         dx, dy, dz = x - hx[i], y - hy[i], z - hz[i]
         q = dx * dx + dy * dy + dz * dz
-        p = exp32(-g[i] * q)
         d2[i] = q
-        phi[i] = p
-        f += w[i] * p
+        phi[i] = exp32(-g[i] * q)
+    # A loop of its own, which stores nothing: the compiler guards loops that store by a check for overlapping memory, and the
+    # guarded ones add in another order. Where arrays happen to lie must not change the last bit of a sum.
+    f = np.float32(0)
+    for i in range(len(phi)):
+        f += w[i] * phi[i]
     return f
 
 
