@@ -21,12 +21,12 @@ from rich.console import Console
 from rich.table import Table
 
 from potclient.holdout import HoldOut
-from potserver.atom_builder.recipe import Reader, open_recording
+from potserver.atoms.build.recipe import Reader, open_recording
+from potserver.commands.eval import asked_scans, variants
 from potserver.domain.dictionary import AtomDictionary
-from potserver.evaluation.command import asked_scans, variants
 from potserver.evaluation.mappers import ServiceMap
 from potserver.evaluation.protocol import evaluate
-from potserver.services.settings import MappingSettings
+from potserver.mapping.settings import MappingSettings
 
 _STEPS = (1, 2, 3, 4, 6, 8)
 _AS_SHIPPED = "as shipped"

@@ -29,13 +29,13 @@ import numpy as np
 
 from potclient import MapClient, PotclientError
 from potserver.adapters import codec
-from potserver.adapters.journal import Journal
-from potserver.adapters.map_file import read_map
-from potserver.adapters.map_store import JOURNAL, TILES
 from potserver.domain.map_state import MapState
 from potserver.domain.types import KernelSet, Scan, yaw_pose
-from potserver.services.mapping import MappingService
-from potserver.services.settings import MappingSettings
+from potserver.mapping.service import MappingService
+from potserver.mapping.settings import MappingSettings
+from potserver.storage.journal import Journal
+from potserver.storage.map_file import read_map
+from potserver.storage.map_store import JOURNAL, TILES
 
 START_S = 600.0  # the first start on a machine compiles
 _BASE_NS = 1_700_000_000_000_000_000

@@ -28,7 +28,7 @@ from potclient.metrics import score
 from potclient.towns import PERIOD_S, SENSORS, Town, TownRecording
 from potclient.towns.streets import Drive
 from potserver import MappingService, MappingSettings
-from potserver.atom_builder.scan_task import to_scan
+from potserver.atoms.build.scan_task import to_scan
 
 _LOOP_M = 200.0
 _SEARCHED = range(-12, 12)  # cells, for the block whose loop is nearest to that length

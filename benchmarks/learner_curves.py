@@ -25,11 +25,11 @@ from rich.table import Table
 from potclient.datasets import Recording, open_dataset
 from potclient.holdout import HoldOut, LabelledPoints
 from potclient.metrics import Metrics, score
-from potserver.atom_builder.scan_task import SectorOf, to_scan
+from potserver.atoms.build.scan_task import SectorOf, to_scan
+from potserver.atoms.learning import LearningSettings, beam_weights, cut_sectors, lattice, learn_kernels
 from potserver.domain.kernel_map import KernelMap
 from potserver.numerics.feature_blocks import feature_blocks
 from potserver.numerics.warm_fit import warm_fit
-from potserver.services.learning import LearningSettings, beam_weights, cut_sectors, lattice, learn_kernels
 
 _GRID_LENGTH = 0.75  # spacings
 _POINTS_PER_KERNEL = 4  # at least, for both: sectors with few points get fewer kernels

@@ -23,8 +23,8 @@ from potclient import MapClient
 from potclient.datasets import open_dataset
 from potclient.holdout import HoldOut
 from potserver.config import Settings
+from potserver.mapping.settings import MappingSettings
 from potserver.server import MapServer
-from potserver.services.settings import MappingSettings
 
 _COMPARED = 20_000  # points at most
 _TIMEOUT_S = 120.0

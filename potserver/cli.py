@@ -254,7 +254,7 @@ def _atom_cells(row: dict[str, Any]) -> tuple[str, ...]:
 
 def _draw_atoms(dictionary: AtomDictionary, options: argparse.Namespace, *, title: str) -> str:
     """Draw the picture; what to say of it."""
-    from potserver.atom_sheet import choose, draw_sheet  # matplotlib takes a second to load
+    from potserver.commands.atom_sheet import choose, draw_sheet  # matplotlib takes a second to load
 
     atoms = choose(dictionary, options.atom, options.limit)
     try:
@@ -288,8 +288,8 @@ def _atoms_export(options: argparse.Namespace) -> int:
 
 def _atoms_import(options: argparse.Namespace) -> int:
     from potserver.adapters import codec
+    from potserver.atoms.admission import admit
     from potserver.domain.dictionary import AtomDictionary
-    from potserver.services.admission import admit
 
     settings = _settings(options)
     out = Path(options.out)
@@ -309,11 +309,11 @@ def _atoms_import(options: argparse.Namespace) -> int:
 
 
 def _atoms_build(options: argparse.Namespace) -> int:
-    from potserver.atom_builder import command  # this loads the numerics
+    from potserver.commands import atoms_build  # this loads the numerics
 
     configure_logging("warning", "console")
     try:
-        dictionary = command.run(options)
+        dictionary = atoms_build.run(options)
     except KeyboardInterrupt:
         _say("potserver: interrupted, nothing was written", sys.stderr)
         return EXIT_FORCED
@@ -323,10 +323,10 @@ def _atoms_build(options: argparse.Namespace) -> int:
 
 
 def _map(options: argparse.Namespace) -> int:
-    from potserver import map_command  # this loads the numerics
+    from potserver.commands import maps  # this loads the numerics
 
     settings = _settings(options) if options.settings_flags else Settings()
-    return map_command.run(options, settings, _say)
+    return maps.run(options, settings, _say)
 
 
 def _eval(options: argparse.Namespace) -> int:
@@ -341,16 +341,16 @@ def _eval(options: argparse.Namespace) -> int:
     }
     overrides.update(_split(assignment, "=", "--set", "KEY=VALUE") for assignment in options.sets)
     settings = load_settings(file=options.settings, environ=os.environ, overrides=overrides)
-    from potserver.evaluation import command  # this loads the numerics
+    from potserver.commands import eval as evaluation  # this loads the numerics
 
     configure_logging("warning", "console")
-    command.run(options, settings)
+    evaluation.run(options, settings)
     return EXIT_OK
 
 
 def _demo(arguments: list[str]) -> int:
     try:
-        demo = importlib.import_module("potserver.demo")
+        demo = importlib.import_module("potserver.commands.demo")
     except ImportError as error:
         _say(f"potserver: the demo is not installed: {error}", sys.stderr)
         return EXIT_USAGE

@@ -25,11 +25,11 @@ import msgspec
 
 from potschemas import keys
 from potschemas.messages import MAX_PART_KERNELS
-from potserver.adapters.limits import Limits
 from potserver.adapters.session import ZenohSettings
+from potserver.atoms.admission import AdmissionSettings
 from potserver.errors import SettingsError
-from potserver.services.admission import AdmissionSettings
-from potserver.services.settings import MappingSettings
+from potserver.limits import Limits
+from potserver.mapping.settings import MappingSettings
 
 tomllib: Any = importlib.import_module("tomllib" if sys.version_info >= (3, 11) else "tomli")
 

@@ -28,7 +28,6 @@ from potserver.adapters import codec
 from potserver.adapters.cloud_subscriber import CloudSubscriber
 from potserver.adapters.intake import IntakeQueue
 from potserver.adapters.log import get_logger
-from potserver.adapters.map_store import MapStore, MemoryOnly
 from potserver.adapters.outbox import Outbox
 from potserver.adapters.ports import Asker, Keeper, Mapper
 from potserver.adapters.pose_subscriber import PoseSubscriber
@@ -40,14 +39,15 @@ from potserver.adapters.receipts import ReceiptSender
 from potserver.adapters.session import build_config, close_session, open_session
 from potserver.adapters.threads import spawn
 from potserver.adapters.writer import MapWriter
+from potserver.asking.service import QueryService
+from potserver.atoms.store import AtomStore
 from potserver.config import Settings, as_tree
 from potserver.domain.dictionary import AtomDictionary
 from potserver.errors import ShuttingDownError
+from potserver.health import Health, rss_bytes
+from potserver.mapping.service import MappingService
 from potserver.numerics.threads import default_threads
-from potserver.services.atom_store import AtomStore
-from potserver.services.health import Health, rss_bytes
-from potserver.services.mapping import MappingService
-from potserver.services.query import QueryService
+from potserver.storage.map_store import MapStore, MemoryOnly
 
 log = get_logger("potserver.server")
 

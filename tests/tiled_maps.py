@@ -9,14 +9,14 @@ import numpy as np
 from potclient.mirror import Ask
 from potschemas import messages, wire
 from potserver.adapters import codec
-from potserver.adapters.limits import Limits
+from potserver.asking.tiles import plan_tiles
 from potserver.domain.kernel_map import KernelMap
 from potserver.domain.map_state import MapState
 from potserver.domain.tiles import COARSE, MapKernels, Tile, TiledMap, TileGrid, TileIndex
 from potserver.domain.types import KernelSet
+from potserver.limits import Limits
+from potserver.mapping.refinement import kernels_at
 from potserver.numerics.evidence import Rows
-from potserver.services.refinement import kernels_at
-from potserver.services.tile_query import plan_tiles
 
 GRID = TileGrid.of(8.0, 0.4)
 

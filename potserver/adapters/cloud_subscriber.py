@@ -8,11 +8,11 @@ from potschemas import keys, messages
 from potserver.adapters import codec
 from potserver.adapters.intake import CloudJob, IntakeQueue
 from potserver.adapters.key_exprs import sender_of
-from potserver.adapters.limits import Limits
 from potserver.adapters.log import get_logger
 from potserver.adapters.receipts import ReceiptSender
 from potserver.errors import PotserverError
-from potserver.services.health import Health
+from potserver.health import Health
+from potserver.limits import Limits
 
 log = get_logger("potserver.clouds")
 

@@ -17,8 +17,9 @@ from numpy.typing import NDArray
 from potschemas import keys, messages, wire
 from potschemas.messages import DType, ErrorCode
 from potserver.adapters.kernel_coding import code_kernels
-from potserver.adapters.limits import Limits
 from potserver.adapters.ports import Snapshot
+from potserver.asking.tiles import MANTISSA_BITS, KnownTiles, TilesPlan
+from potserver.atoms.store import AtomChange
 from potserver.domain.running_scores import RunningScores
 from potserver.domain.types import (
     AnswerRule,
@@ -47,9 +48,8 @@ from potserver.errors import (
     UnknownRobotError,
     error_classes,
 )
-from potserver.services.atom_store import AtomChange
-from potserver.services.health import Latency
-from potserver.services.tile_query import MANTISSA_BITS, KnownTiles, TilesPlan
+from potserver.health import Latency
+from potserver.limits import Limits
 
 MessageT = TypeVar("MessageT", bound=messages.Message)
 UNKNOWN_SEQ = -1  # in the receipt of a cloud whose number could not be read

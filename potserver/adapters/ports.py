@@ -8,6 +8,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from potserver.asking.tiles import KnownTiles, TilesPlan
 from potserver.domain.dictionary import AtomDictionary
 from potserver.domain.map_state import MapState
 from potserver.domain.running_scores import RunningScores
@@ -23,8 +24,7 @@ from potserver.domain.types import (
     TileChange,
     Unknown,
 )
-from potserver.services.settings import MappingSettings
-from potserver.services.tile_query import KnownTiles, TilesPlan
+from potserver.mapping.settings import MappingSettings
 
 
 class Payload(Protocol):

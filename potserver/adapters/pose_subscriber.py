@@ -10,7 +10,7 @@ from potserver.adapters.key_exprs import sender_of
 from potserver.adapters.log import get_logger
 from potserver.adapters.poses import PoseBuffer
 from potserver.errors import PotserverError
-from potserver.services.health import Health
+from potserver.health import Health
 
 log = get_logger("potserver.poses")
 

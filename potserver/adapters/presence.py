@@ -9,7 +9,7 @@ import zenoh
 from potschemas import keys
 from potserver.adapters.key_exprs import sender_of
 from potserver.adapters.log import get_logger
-from potserver.services.health import Health
+from potserver.health import Health
 
 log = get_logger("potserver.presence")
 

@@ -19,13 +19,13 @@ from potschemas import keys, messages
 from potserver.adapters import codec
 from potserver.adapters.intake import Barrier, CloudJob, IntakeQueue
 from potserver.adapters.key_exprs import is_wild
-from potserver.adapters.limits import Limits
 from potserver.adapters.log import get_logger
 from potserver.adapters.outbox import Outbox
 from potserver.adapters.ports import Asker, Mapper, RayPlan, RiskPlan
 from potserver.adapters.query_pool import QueryJob, QueryPool
 from potserver.adapters.receipts import ReceiptSender
 from potserver.adapters.writer import MapWriter
+from potserver.atoms.store import AtomChange, AtomStore
 from potserver.errors import (
     BadMessageError,
     DeadlineError,
@@ -33,8 +33,8 @@ from potserver.errors import (
     ShuttingDownError,
     UnsupportedError,
 )
-from potserver.services.atom_store import AtomChange, AtomStore
-from potserver.services.health import Health
+from potserver.health import Health
+from potserver.limits import Limits
 
 log = get_logger("potserver.queries")
 

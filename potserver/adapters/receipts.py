@@ -18,13 +18,13 @@ import zenoh
 from potschemas.keys import MapKeys
 from potserver.adapters import codec
 from potserver.adapters.intake import CloudJob, IntakeQueue
-from potserver.adapters.limits import Limits
 from potserver.adapters.log import get_logger
 from potserver.adapters.outbox import End, Outbox
 from potserver.adapters.ports import Mapper
 from potserver.domain.types import MapUpdate, Scan, TileChange
 from potserver.errors import PotserverError, TooLargeError
-from potserver.services.health import Health
+from potserver.health import Health
+from potserver.limits import Limits
 
 log = get_logger("potserver.receipts")
 

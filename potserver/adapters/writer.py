@@ -8,7 +8,6 @@ from collections.abc import Mapping
 
 from potserver.adapters import codec
 from potserver.adapters.intake import CloudJob, IntakeQueue
-from potserver.adapters.limits import Limits
 from potserver.adapters.log import get_logger
 from potserver.adapters.ports import Keeper, Mapper
 from potserver.adapters.poses import PoseBuffer
@@ -17,7 +16,8 @@ from potserver.adapters.stamps import check_not_future
 from potserver.domain.map_state import MapState
 from potserver.domain.types import Float64, Scan, TileChange
 from potserver.errors import OldStampError, PotserverError
-from potserver.services.health import Health
+from potserver.health import Health
+from potserver.limits import Limits
 
 log = get_logger("potserver.writer")
 

@@ -9,12 +9,12 @@ import numpy as np
 
 from potclient.datasets import RecordedScan
 from potclient.results import Bool, Float64
-from potserver.atom_builder.scan_task import to_scan
+from potserver.atoms.build.scan_task import to_scan
 from potserver.domain.dictionary import AtomDictionary
 from potserver.domain.kernel_map import KernelMap
 from potserver.domain.types import KernelSet
-from potserver.services.mapping import MappingService
-from potserver.services.settings import MappingSettings
+from potserver.mapping.service import MappingService
+from potserver.mapping.settings import MappingSettings
 
 _NUMBERS_A_KERNEL = 10  # position, its variances, gamma's shape and rate, the weight and its variance
 

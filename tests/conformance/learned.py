@@ -11,9 +11,9 @@ from scipy.spatial import cKDTree
 from scipy.stats import mannwhitneyu
 
 from potclient.datasets import open_dataset
+from potserver.atoms.learning import LearningSettings, cut_sectors, learn_atoms
 from potserver.domain.types import Atom, Bool, Float64, Scan
 from potserver.numerics.abhm import AbhmEpoch
-from potserver.services.learning import LearningSettings, cut_sectors, learn_atoms
 
 TOWNS = ("town:terraces:1", "town:offices:2d:1")  # a street in 3D; rooms and a corridor in 2D
 SETTINGS = LearningSettings(

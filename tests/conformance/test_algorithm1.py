@@ -11,12 +11,12 @@ import pytest
 
 from potserver.domain.dictionary import AtomDictionary
 from potserver.domain.types import KernelSet, Scan, yaw_pose
+from potserver.mapping.matching import Match
+from potserver.mapping.service import MappingService
+from potserver.mapping.settings import PAPER, MappingSettings
+from potserver.mapping.transport import transport
 from potserver.numerics.beams import Beams, label_beams
 from potserver.numerics.geometry import rotation_z
-from potserver.services.mapping import MappingService
-from potserver.services.matching import Match
-from potserver.services.settings import PAPER, MappingSettings
-from potserver.services.transport import transport
 from tests.conformance import reference
 
 N_HITS = 45

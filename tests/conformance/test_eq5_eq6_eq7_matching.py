@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from potserver.domain.dictionary import AtomDictionary
+from potserver.mapping.matching import Matcher
+from potserver.mapping.settings import MappingSettings, RankScore
 from potserver.numerics.geometry import rotation_z
-from potserver.services.matching import Matcher
-from potserver.services.settings import MappingSettings, RankScore
 from tests.conformance import reference
 
 ROTATIONS_DEG = tuple(45.0 * k for k in range(-4, 4))

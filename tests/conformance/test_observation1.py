@@ -16,9 +16,9 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from potserver.atoms.learning import beam_weights
 from potserver.domain.types import Float64
 from potserver.numerics.abhm import AbhmSettings, fit_abhm
-from potserver.services.learning import beam_weights
 from tests.conformance.learned import SETTINGS, TOWNS, LearnedSector, auc, learned_town
 
 _NEAR, _FAR = 0.5, 1.5  # length scales from the nearest hit: at a surface, and away from all

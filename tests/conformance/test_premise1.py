@@ -15,8 +15,8 @@ import pytest
 from numpy.typing import NDArray
 from scipy.stats import spearmanr
 
+from potserver.atoms.distance import atom_distances
 from potserver.domain.types import Float64
-from potserver.services.atom_distance import atom_distances
 from tests.conformance import reference
 from tests.conformance.learned import TOWNS, LearnedSector, learned_town
 

@@ -11,9 +11,9 @@ from potclient import MapClient
 from potschemas import messages, wire
 from potschemas.keys import DEFAULT_ROOT
 from potschemas.messages import ErrorCode
+from potserver.asking.service import QueryService
 from potserver.domain.types import Unknown
 from potserver.server import MapServer
-from potserver.services.query import QueryService
 
 from .conftest import Client, points_query
 

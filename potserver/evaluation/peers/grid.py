@@ -11,10 +11,10 @@ from potclient.results import Bool, Float64
 from potserver.domain.kernel_map import KernelMap
 from potserver.domain.types import KernelSet
 from potserver.evaluation.mappers import Mapper, Size, kernel_bytes
+from potserver.mapping.refinement import kernels_at
 from potserver.numerics.feature_blocks import feature_blocks
 from potserver.numerics.lattice_nodes import new_nodes
 from potserver.numerics.warm_fit import warm_fit
-from potserver.services.refinement import kernels_at
 
 _SAMPLES = 200_000  # of all scans together: what a batch solve can hold
 _FREE_A_BEAM = 2

@@ -1,0 +1,1 @@
+"""Atoms: how they are learned, chosen, admitted and kept."""

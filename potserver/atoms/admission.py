@@ -1,0 +1,227 @@
+"""Which atoms may join a dictionary. Every scan of every robot is matched against them, so one bad atom spoils many maps."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import re
+from enum import Enum
+
+import numpy as np
+
+from potserver.atoms.distance import atom_distances, near_in_spread
+from potserver.domain.dictionary import AtomDictionary
+from potserver.domain.kernel_map import KernelMap
+from potserver.domain.types import Atom, Float32, Float64
+from potserver.errors import AtomRefusedError, SettingsError
+
+# the ids of keys and messages; an atom's id is also the name of its file
+_LEGAL_ID = re.compile(r"[a-z0-9][a-z0-9_.-]{0,62}")
+_COMPARED = 500  # points of each label that decide on a near duplicate: fewer leave too much to the choice of the points
+
+
+class Refusal(str, Enum):
+    """Why an atom may not join."""
+
+    ILLEGAL_ID = "illegal_id"
+    TAKEN_ID = "taken_id"
+    FULL = "full"  # the dictionary holds as many atoms as it may
+    BAD_PROVENANCE = "bad_provenance"
+    BAD_SECTOR = "bad_sector"
+    NO_POINTS = "no_points"  # both labels are needed: one alone cannot tell occupied from free
+    NO_KERNELS = "no_kernels"
+    TOO_MANY_POINTS = "too_many_points"
+    TOO_MANY_KERNELS = "too_many_kernels"
+    POINTS_OUTSIDE = "points_outside"
+    KERNELS_OUTSIDE = "kernels_outside"
+    WILD_KERNELS = "wild_kernels"  # weights, variances or widths out of range
+    UNEXPLAINED = "unexplained"  # the kernels do not tell the atom's own hits from its own free points
+    DUPLICATE = "duplicate"
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class AdmissionSettings:
+    """Bounds on an atom; those that the built-in ones need are far inside."""
+
+    max_atoms: int = 1_500  # each is compared with every sector, and their list is one message
+    max_points: int = 2_000  # of each label
+    max_kernels: int = 4_000
+    max_provenance_chars: int = 4_000
+    max_radius_m: float = 200.0
+    point_margin_m: float = 0.1  # that points may lie outside the sector
+    kernel_margin_m: float = 3.0  # that kernels may
+    max_abs_weight: float = 500.0  # log-odds; the built-in atoms reach 58
+    max_weight_var: float = 1_000.0  # log-odds^2; the built-in atoms reach 199
+    min_length_scale_m: float = 0.05  # 1 / sqrt(2 gamma)
+    max_length_scale_m: float = 20.0
+    min_auc: float = (
+        0.9  # of the atom's own hits over its own free points; the built-in atoms have 0.958 to 1
+    )
+    min_distance_m2: float = 0.25  # to every other atom, squared 2-Wasserstein; the built-in atoms keep 2.3
+
+    def __post_init__(self) -> None:
+        for field in dataclasses.fields(self):
+            value = getattr(self, field.name)
+            if not (math.isfinite(value) and value >= 0):
+                raise SettingsError(f"atoms.admission.{field.name} is {value!r}, need a number of at least 0")
+
+
+@np.errstate(
+    over="ignore", divide="ignore", invalid="ignore"
+)  # wild numbers may overflow on the way to their refusal
+def admit(
+    atom: Atom, dictionary: AtomDictionary, settings: AdmissionSettings | None = None, *, threads: int = 1
+) -> None:
+    """Check an atom against the rules, the cheap ones first.
+
+    Args:
+        atom: The newcomer. Its types have checked the shapes of its arrays, and that they are finite.
+        dictionary: What it would join.
+        settings: The bounds.
+        threads: Threads of the comparison with the others.
+    Raises:
+        AtomRefusedError: it may not join; `reason` is a `Refusal`.
+    """
+    s = settings or AdmissionSettings()
+    _check_record(atom, dictionary, s)
+    _check_counts(atom, s)
+    _check_place(atom, s)
+    _check_kernels(atom, s)
+    auc = own_auc(atom)
+    if auc < s.min_auc:
+        raise _refused(
+            Refusal.UNEXPLAINED,
+            f"its kernels tell its own hits from its own free points with AUC {auc:.3f}, need {s.min_auc}: learn it again",
+        )
+    _check_new(atom, dictionary, s, threads)
+
+
+def own_auc(atom: Atom) -> float:
+    """How well the kernels rank the points that they were learned from, hits over free points: 0.5 is a guess.
+
+    Near 1 for any sound atom. It says nothing about accuracy on other data.
+    """
+    rank = KernelMap(atom.kernels, observed_activation=1e-3, threads=1)
+    hits, free = (rank.occupancy(points).latent_mean for points in (atom.hit_points, atom.free_points))
+    free = np.sort(free)
+    below = np.searchsorted(free, hits, "left") + np.searchsorted(free, hits, "right")
+    return float(below.mean() / (2 * len(free)))
+
+
+def _check_record(atom: Atom, dictionary: AtomDictionary, s: AdmissionSettings) -> None:
+    if not _LEGAL_ID.fullmatch(atom.atom_id):
+        raise _refused(
+            Refusal.ILLEGAL_ID,
+            f"the id {atom.atom_id[:80]!r} is not 1 to 63 of a-z 0-9 _ . - that start with a letter or digit",
+        )
+    if atom.atom_id in dictionary:
+        raise _refused(
+            Refusal.TAKEN_ID,
+            f"the dictionary has an atom {atom.atom_id!r}: remove it first, or take another id",
+        )
+    if len(dictionary) >= s.max_atoms:
+        raise _refused(
+            Refusal.FULL, f"the dictionary holds {len(dictionary)} atoms, the limit is {s.max_atoms}"
+        )
+    n_chars = sum(len(key) + len(value) for key, value in atom.provenance.items())
+    if n_chars > s.max_provenance_chars:
+        raise _refused(
+            Refusal.BAD_PROVENANCE,
+            f"the provenance has {n_chars} characters, the limit is {s.max_provenance_chars}",
+        )
+    if not (0 < atom.radius_m <= s.max_radius_m and 0 < atom.azimuth_width_rad <= 2 * math.pi + 1e-6):
+        raise _refused(
+            Refusal.BAD_SECTOR,
+            f"the sector has a radius of {atom.radius_m:g} m and a width of {atom.azimuth_width_rad:g} rad;"
+            f" need at most {s.max_radius_m:g} m and 2 pi",
+        )
+
+
+def _check_counts(atom: Atom, s: AdmissionSettings) -> None:
+    for name, points in (("hits", atom.hit_points), ("free points", atom.free_points)):
+        if len(points) == 0:
+            raise _refused(Refusal.NO_POINTS, f"it has no {name}: an atom needs points of both labels")
+        if len(points) > s.max_points:
+            raise _refused(
+                Refusal.TOO_MANY_POINTS,
+                f"it has {len(points)} {name}, the limit is {s.max_points}: thin them",
+            )
+    if len(atom.kernels) == 0:
+        raise _refused(Refusal.NO_KERNELS, "it has no kernels: nothing could be carried")
+    if len(atom.kernels) > s.max_kernels:
+        raise _refused(
+            Refusal.TOO_MANY_KERNELS, f"it has {len(atom.kernels)} kernels, the limit is {s.max_kernels}"
+        )
+
+
+def _check_place(atom: Atom, s: AdmissionSettings) -> None:
+    for refusal, name, points, margin_m in (
+        (Refusal.POINTS_OUTSIDE, "hit", atom.hit_points, s.point_margin_m),
+        (Refusal.POINTS_OUTSIDE, "free point", atom.free_points, s.point_margin_m),
+        (Refusal.KERNELS_OUTSIDE, "kernel", atom.kernels.hinge_mean, s.kernel_margin_m),
+    ):
+        outside_m = float(_outside(atom, points).max())
+        if not outside_m <= margin_m:
+            raise _refused(
+                refusal,
+                f"a {name} lies {outside_m:.2f} m outside the sector of {math.degrees(atom.azimuth_width_rad):.0f} degrees and"
+                f" {atom.radius_m:g} m, up to {margin_m:g} m are allowed: x is the sector's bisector, the sensor its apex",
+            )
+
+
+def _outside(atom: Atom, points: Float32 | Float64) -> Float64:
+    """(N,) m: how far points lie outside the sector, or outside its plane if it has two dimensions; 0 inside."""
+    x, y, z = np.asarray(points, np.float64).T
+    reach = np.hypot(x, y)
+    beyond_side = np.abs(np.arctan2(y, x)) - atom.azimuth_width_rad / 2.0
+    # behind the apex the nearest point of the sector is the apex itself
+    aside = reach * np.sin(np.clip(beyond_side, 0.0, math.pi / 2.0))
+    above = np.abs(z) - (atom.radius_m if atom.dims == 3 else 0.0)
+    return np.maximum.reduce([reach - atom.radius_m, aside, above, np.zeros(len(x))])
+
+
+def _check_kernels(atom: Atom, s: AdmissionSettings) -> None:
+    kernels = atom.kernels
+    length_scale = 1.0 / np.sqrt(2.0 * kernels.gamma.astype(np.float64))
+    for name, values, low, high in (
+        ("weight", kernels.weight_mean, -s.max_abs_weight, s.max_abs_weight),
+        ("weight variance", kernels.weight_var, 1e-9, s.max_weight_var),
+        ("length scale", length_scale, s.min_length_scale_m, s.max_length_scale_m),
+        # a position that is less sure than the kernel is wide says nothing
+        ("standard deviation of a hinge", np.sqrt(kernels.hinge_var), 0.0, s.max_length_scale_m),
+    ):
+        least, most = float(values.min()), float(values.max())
+        if not low <= least <= most <= high:
+            raise _refused(
+                Refusal.WILD_KERNELS,
+                f"{name}: {least:.3g} to {most:.3g}, the allowed range is {low:.3g} to {high:.3g}",
+            )
+
+
+def _check_new(atom: Atom, dictionary: AtomDictionary, s: AdmissionSettings, threads: int) -> None:
+    """Refuse what the dictionary has already: the blur of the entropy is taken off, so that an equal atom is at distance 0."""
+    others = [
+        other for other in dictionary.of_dims(atom.dims) if near_in_spread(atom, other, s.min_distance_m2)
+    ]
+    if not others:
+        return
+    both = [atom, *others]
+    to_others = atom_distances([atom], both, n_hits=_COMPARED, n_free=_COMPARED, threads=threads)[0]
+    own = np.array(
+        [
+            float(atom_distances([a], [a], n_hits=_COMPARED, n_free=_COMPARED, threads=threads)[0, 0])
+            for a in both
+        ]
+    )
+    distance = to_others[1:] - (own[0] + own[1:]) / 2.0
+    nearest = int(np.argmin(distance))
+    if distance[nearest] < s.min_distance_m2:
+        raise _refused(
+            Refusal.DUPLICATE,
+            f"it is a near duplicate of {others[nearest].atom_id!r}: squared distance {max(distance[nearest], 0.0):.3f} m^2,"
+            f" need {s.min_distance_m2:g}",
+        )
+
+
+def _refused(refusal: Refusal, why: str) -> AtomRefusedError:
+    return AtomRefusedError(why, reason=refusal.value)

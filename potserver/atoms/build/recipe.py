@@ -1,0 +1,214 @@
+"""What a dictionary is made of: recordings, how they are read and learned, and how their atoms are chosen. TOML."""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import importlib
+import re
+import sys
+from collections.abc import Mapping
+from importlib import resources
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import msgspec
+
+from potclient.datasets import Recording, open_dataset
+from potclient.errors import DatasetError
+from potserver import bundled
+from potserver.atoms.learning import LearningSettings
+from potserver.errors import SettingsError
+
+tomllib: Any = importlib.import_module("tomllib" if sys.version_info >= (3, 11) else "tomli")
+
+BUILTIN_RECIPE = "builtin_atoms.toml"
+SHARE_OF_RADIUS = 0.15  # of an atom's radius: the tolerance where none is stated
+_BUNDLED_PREFIX = "bundled:"
+_SLICE = re.compile(r"(\d*)(:)(\d*)(?::([1-9]\d*))?\Z")
+
+_AtLeastOne = Annotated[int, msgspec.Meta(ge=1)]
+_NotNegative = Annotated[float, msgspec.Meta(ge=0.0)]
+
+
+class Reader(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """How a recording is opened: the options of `potclient.datasets.open_dataset`."""
+
+    format: str = "auto"
+    poses: str | None = None
+    frame: str = "auto"
+    no_return_m: float | None = None
+    min_range_m: float = 0.0
+    max_range_m: float | None = None
+    n_generated: _AtLeastOne = 100  # scans of a made-up recording
+
+
+class Quality(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What an atom must reach on the held-out beams of its own sector to be a candidate."""
+
+    min_points: _AtLeastOne = 10  # held-out points, hits and free points together; a planar scan has few
+    min_auc: Annotated[float, msgspec.Meta(ge=0.0, le=1.0)] = 0.8
+    max_nll: _NotNegative = 0.6  # nats; knowing nothing scores 0.69
+
+
+class RecordingRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """One recording, and what differs for it from the recipe's own settings."""
+
+    dataset: str  # a path, `bundled:NAME`, or anything else that `open_dataset` knows
+    name: Annotated[str, msgspec.Meta(pattern=r"^[a-z0-9][a-z0-9_.-]{0,39}$")] | None = (
+        None  # prefix of the atoms' ids; default: from the dataset
+    )
+    licence: str = "not stated"
+    scans: int | str = ":"  # the first N, or START:STOP:STEP
+    window: _AtLeastOne = (
+        1  # scans, from each taken one on, that are learned together; a 2D scan alone shows little
+    )
+    dims: Literal[2, 3] | None = None  # what its scans must have
+    max_atoms: _AtLeastOne | None = None  # kept of this recording
+    tolerance_m: _NotNegative | None = None
+    reader: Reader = Reader()
+    learner: dict[str, Any] = {}  # fields of LearningSettings
+
+    @property
+    def prefix(self) -> str:
+        """`name`, or the dataset's last two parts, e.g. `kitti-00`."""
+        if self.name is not None:
+            return self.name
+        if _is_spec(self.dataset):
+            parts = self.dataset.removeprefix(_BUNDLED_PREFIX).split(":")
+        else:
+            parts = list(Path(self.dataset).resolve().with_suffix("").parts[-2:])
+        return re.sub(r"[^a-z0-9.-]+", "-", "-".join(parts).lower()).strip("-.")[:40]
+
+    def numbers(self, n_scans: int) -> range:
+        """The scans that are taken of a recording of `n_scans`."""
+        if isinstance(self.scans, int):
+            return range(min(self.scans, n_scans))
+        start, _, stop, step = _SLICE.match(self.scans).groups()  # type: ignore[union-attr] # checked when read
+        return range(n_scans)[int(start or 0) : int(stop or n_scans) : int(step or 1)]
+
+
+class Recipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A whole dictionary."""
+
+    recordings: Annotated[tuple[RecordingRecipe, ...], msgspec.Meta(min_length=1)]
+    # no candidate is left farther than this from a kept atom (atoms/cover.py)
+    tolerance_m: _NotNegative | None = None
+    max_atoms: _AtLeastOne | None = None  # kept in each number of dimensions
+    later_scans: Annotated[int, msgspec.Meta(ge=0)] = 2  # whose held-out beams also judge an atom
+    seed: Annotated[int, msgspec.Meta(ge=0)] = 0
+    quality: Quality = Quality()
+    learner: dict[str, Any] = {}  # fields of LearningSettings, for all recordings
+
+    def tolerance_of(self, recording: RecordingRecipe, radius_m: float) -> float:
+        """The recording's tolerance, else the recipe's, else a share of an atom's radius, m."""
+        for stated in (recording.tolerance_m, self.tolerance_m):
+            if stated is not None:
+                return stated
+        return SHARE_OF_RADIUS * radius_m
+
+    def learner_of(self, recording: RecordingRecipe) -> LearningSettings:
+        """Defaults < the recipe's `learner` < the recording's."""
+        return learning_settings(self.learner | recording.learner)
+
+
+def read_recipe(path: str | Path) -> Recipe:
+    """Read a recipe file.
+
+    Raises:
+        SettingsError: no such file, not TOML, an unknown key, or an illegal value; the message says which.
+    """
+    path = Path(path)
+    try:
+        tree = tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise SettingsError(f"cannot read recipe {path}: {error.strerror}") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise SettingsError(f"recipe {path} is not TOML: {error}") from error
+    return parse_recipe(tree, str(path))
+
+
+def builtin_recipe() -> Recipe:
+    """The recipe of the dictionary that the package ships."""
+    return read_recipe(Path(str(resources.files("potserver") / "data" / BUILTIN_RECIPE)))
+
+
+def parse_recipe(tree: Mapping[str, Any], source: str) -> Recipe:
+    """Check a tree of plain values.
+
+    Args:
+        tree: As read from TOML.
+        source: Where it came from, for messages.
+    Raises:
+        SettingsError: as for `read_recipe`.
+    """
+    try:
+        recipe = msgspec.convert(tree, Recipe, strict=True)
+        for recording in recipe.recordings:
+            recipe.learner_of(recording)
+            if isinstance(recording.scans, int) and recording.scans < 1:
+                raise SettingsError(f"scans = {recording.scans}: need at least 1")
+            if isinstance(recording.scans, str) and not _SLICE.match(recording.scans):
+                raise SettingsError(f"scans = {recording.scans!r}: need a number, or START:STOP:STEP")
+    except (msgspec.ValidationError, SettingsError) as error:
+        raise SettingsError(f"{source}: {error}") from error
+    names = [recording.prefix for recording in recipe.recordings]
+    if len(set(names)) < len(names):
+        raise SettingsError(f"{source}: the recordings' names must differ, got {', '.join(names)}")
+    return recipe
+
+
+def learning_settings(values: Mapping[str, Any]) -> LearningSettings:
+    """The learner's settings with some of them given.
+
+    Raises:
+        SettingsError: an unknown key, or a value of another type.
+    """
+    known = [field.name for field in dataclasses.fields(LearningSettings)]
+    for key in values:
+        if key not in known:
+            near = difflib.get_close_matches(key, known, n=1)
+            raise SettingsError(
+                f"no learner setting {key!r}" + (f"; did you mean {near[0]}?" if near else "")
+            )
+    try:
+        return msgspec.convert(dict(values), LearningSettings, strict=True)
+    except msgspec.ValidationError as error:
+        raise SettingsError(f"learner: {error}") from error
+
+
+def located(recording: RecordingRecipe, folder: Path) -> RecordingRecipe:
+    """The same recording with its relative paths, which start at the recipe's folder, made absolute."""
+    poses = recording.reader.poses
+    return msgspec.structs.replace(
+        recording,
+        dataset=recording.dataset
+        if _is_spec(recording.dataset)
+        else str((folder / recording.dataset).resolve()),
+        reader=msgspec.structs.replace(
+            recording.reader, poses=poses if poses is None else str((folder / poses).resolve())
+        ),
+    )
+
+
+def open_recording(dataset: str, reader: Reader) -> Recording:
+    """Open what `dataset` names.
+
+    Raises:
+        DatasetError: nothing there, not recognised, or damaged.
+    """
+    if not dataset.startswith(_BUNDLED_PREFIX):
+        return open_dataset(dataset, **msgspec.structs.asdict(reader))
+    if reader != Reader():
+        raise DatasetError(f"{dataset}: bundled recordings take no reader options")
+    name = dataset.removeprefix(_BUNDLED_PREFIX)
+    try:
+        return bundled.open_bundled(name)
+    except KeyError:
+        names = ", ".join(bundled.NAMES)
+        raise DatasetError(f"no bundled recording {name!r}; there are {names}") from None
+
+
+def _is_spec(dataset: str) -> bool:
+    """Whether this is a name like `town:terraces:1` or `generated`, and not a path."""
+    return bool(re.match(r"[a-z]+(:|\Z)", dataset)) and (":" in dataset or dataset == "generated")

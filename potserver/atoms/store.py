@@ -1,0 +1,88 @@
+"""AtomStore: the one dictionary of a server, which may change while maps are built from it."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+from potserver.atoms.admission import AdmissionSettings, admit
+from potserver.domain.dictionary import AtomDictionary
+from potserver.domain.types import Atom
+from potserver.errors import ReadOnlyError
+
+
+class AtomChange(NamedTuple):
+    """A change that was made."""
+
+    atom_id: str
+    n_atoms: int  # in the dictionary now
+    persisted: bool  # it is on the disk, and outlives the server
+
+
+class AtomStore:
+    """Changes come one at a time, from any thread: checked, written, then used from each map's next scan on."""
+
+    def __init__(
+        self,
+        dictionary: AtomDictionary,
+        use: Callable[[AtomDictionary], None],
+        *,
+        settings: AdmissionSettings | None = None,
+        writable: bool = True,
+        file: Path | None = None,
+        threads: int = 1,
+    ) -> None:
+        """Hold a dictionary.
+
+        Args:
+            dictionary: What the maps use already.
+            use: Called with the new dictionary after each change.
+            settings: Which atoms may join.
+            writable: Whether changes are taken at all.
+            file: Where each change is written before it counts; None keeps changes in memory.
+            threads: Threads that one change may use.
+        """
+        self._dictionary, self._use = dictionary, use
+        self._settings = settings or AdmissionSettings()
+        self._writable, self._file, self._threads = writable, file, threads
+        self._lock = threading.Lock()
+
+    @property
+    def dictionary(self) -> AtomDictionary:
+        """The dictionary now."""
+        return self._dictionary
+
+    def add(self, atom: Atom) -> AtomChange:
+        """Let an atom join.
+
+        Raises:
+            ReadOnlyError: no changes are taken. AtomRefusedError: it breaks a rule. DictionaryError: the disk refuses.
+            In all cases the dictionary is as before.
+        """
+        self._check_writable()
+        with self._lock:
+            admit(atom, self._dictionary, self._settings, threads=self._threads)
+            return self._change(atom.atom_id, self._dictionary.add(atom))
+
+    def remove(self, atom_id: str) -> AtomChange:
+        """Let an atom go; maps keep the kernels that were carried from it.
+
+        Raises:
+            ReadOnlyError: no changes are taken. UnknownAtomError: there is none of that id. DictionaryError: the disk refuses.
+        """
+        self._check_writable()
+        with self._lock:
+            return self._change(atom_id, self._dictionary.remove(atom_id))
+
+    def _change(self, atom_id: str, changed: AtomDictionary) -> AtomChange:
+        if self._file is not None:
+            changed.save(self._file)
+        self._use(changed)
+        self._dictionary = changed
+        return AtomChange(atom_id, len(changed), persisted=self._file is not None)
+
+    def _check_writable(self) -> None:
+        if not self._writable:
+            raise ReadOnlyError("this server takes no changes of its dictionary (atoms.writable is false)")

@@ -1,0 +1,1 @@
+"""The verbs of the command `potserver`, a module each."""

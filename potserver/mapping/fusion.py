@@ -1,0 +1,350 @@
+"""A scan enters the overall map: its samples become evidence, kernels are put where they are missing, and weights follow.
+
+Evidence ages where a half-life is set: a tile's rows weigh less the longer ago they were looked at, in the map's own time.
+Tiles around a scan age as it comes; of the others one part a scan, the stalest first, so that they drift back to unknown.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from potserver.domain.tiles import (
+    CARRIED,
+    COARSE,
+    FINE,
+    MapKernels,
+    Region,
+    Tile,
+    TiledMap,
+    TileGrid,
+    TileIndex,
+    part_of,
+    tiles_of_part,
+)
+from potserver.domain.types import Bool, Float32, Float64, KernelSet
+from potserver.errors import SolverError
+from potserver.mapping.refinement import activation, gamma_of_spacing, kernels_at
+from potserver.mapping.settings import MappingSettings
+from potserver.numerics import evidence
+from potserver.numerics.beams import Beams, LabelledPoints, beam_weights
+from potserver.numerics.feature_blocks import feature_blocks, gradient_and_diagonal
+from potserver.numerics.geometry import bounds, inside_box
+from potserver.numerics.lattice_nodes import new_nodes
+from potserver.numerics.warm_fit import warm_fit
+
+_FINEST_M, _COARSEST_M, _FINE_PER_RANGE = 0.2, 0.4, 1.0 / 20.0
+_COARSE_REACH = 1.0  # spacings: nearer coarse nodes than this get a kernel, see lattice_nodes.new_nodes
+_TOO_WIDE = 1.5  # coarse spacings
+_REACHED = 0.1  # activation by a carried kernel below which a point or a row is not its own
+_EXPLAINED = 1.0  # activation by carried kernels at which the lattice adds none
+_LONGEST_STEP = 4.0  # Newton steps
+_UNSUPPORTED = 1e-5  # of a kernel's curvature: what no row within its reach leaves
+_STALE = 0.125  # half-lives after which a tile that no scan touches is fitted again
+
+
+class Moment(NamedTuple):
+    """The change that is being made: what its tiles are marked with, and what older evidence weighs by now."""
+
+    revision: int  # of the map, afterwards
+    stamp_ns: int  # map time
+    half_life_s: float = 0.0  # 0: evidence does not age
+
+    def weight_of(self, tile: Tile) -> float:
+        """What a tile's evidence still weighs."""
+        if not self.half_life_s:
+            return 1.0
+        return float(0.5 ** (max(self.stamp_ns - tile.stamp_ns, 0) / 1e9 / self.half_life_s))
+
+
+class Fused(NamedTuple):
+    """What a scan makes of the map."""
+
+    tiles: dict[TileIndex, Tile]  # those that are new or other than before
+    n_added: int
+    n_transported: int  # of those added
+    converged: bool
+
+
+def grid_for(beams: Beams, settings: MappingSettings) -> TileGrid:
+    """The grid of a map that starts with these beams: far looks are spread thinly and need wider kernels."""
+    fine = settings.fine_m
+    if not fine:
+        length = np.linalg.norm(beams.ends[beams.is_return] if beams.is_return.any() else beams.ends, axis=1)
+        fine = float(np.clip(_FINE_PER_RANGE * np.median(length), _FINEST_M, _COARSEST_M))
+    return TileGrid.of(settings.tile_size_m, fine)
+
+
+def fuse(
+    tiled: TiledMap,
+    labelled: LabelledPoints,
+    beams: Beams,
+    origin: Float64,
+    carried: KernelSet,
+    settings: MappingSettings,
+    *,
+    source: int,
+    moment: Moment,
+    planar: bool,
+    threads: int,
+) -> Fused:
+    """Add a scan to the tiles around it, and solve all weights near it jointly on all evidence there.
+
+    Args:
+        tiled: The map; it is not changed.
+        labelled: The scan's points, map frame.
+        beams: The scan's beams, relative to `origin`.
+        origin: (3,) m, map frame.
+        carried: Transported kernels, map frame; weights and variances as prior.
+        settings: Of the pipeline.
+        source: The robot's number in the map.
+        moment: Of the change.
+        planar: Keep kernels in the plane of the points.
+        threads: Threads of the solve.
+    Raises:
+        SolverError: the solve ended without numbers.
+        SettingsError: the scan is too wide for the resolution.
+    """
+    grid = tiled.grid
+    pad = grid.coarse_m
+    lower, upper = bounds(labelled.points)
+    lower, upper = lower - pad, upper + pad
+    region = Region.of(tiled, lower - 4 * pad, upper + 4 * pad, moment.weight_of)
+    points, occupied, weight = labelled.points - region.origin_m, labelled.occupied, beam_weights(labelled)
+    samples = points
+    if settings.fade_rate:
+        start = origin - region.origin_m
+        seen = evidence.see_through(
+            region.rows, beams.ends + start, beams.is_return, start, fine_m=grid.fine_m,
+            rate=settings.fade_rate, gap_m=settings.gap_m, threads=threads,
+        )  # fmt: skip
+        samples = np.concatenate([points, seen.points])
+        occupied = np.concatenate([occupied, np.zeros(len(seen.points), bool)])
+        weight = np.concatenate([weight, seen.weight])
+    inside = lower - region.origin_m, upper - region.origin_m  # of tiles that are stored again
+    new_rows = add_evidence(
+        region, samples, occupied, weight, source, settings, within=inside, turn=moment.revision
+    )
+    taken = KernelSet.empty()
+    if settings.carry_into_map:
+        taken = _wanted(carried.moved(-region.origin_m), region.kernels, points, grid, threads)
+        # samples may count at a row that a narrow kernel does not reach: the solve would only drop it
+        where = evidence.positions(region.rows, grid.fine_m)
+        taken = taken.take(_support(taken, where, grid, threads) >= _REACHED)
+    added = add_kernels(region, new_rows, MapKernels.new(taken, CARRIED), planar, settings, threads)
+    fitted = _fit(region, *inside, settings, threads)
+    return Fused(
+        region.tiles(lower, upper, revision=moment.revision, stamp_ns=moment.stamp_ns),
+        len(added), int((added.level == CARRIED).sum()), fitted,
+    )  # fmt: skip
+
+
+def append(tiled: TiledMap, carried: KernelSet, moment: Moment) -> dict[TileIndex, Tile]:
+    """The tiles of a map that takes transported kernels as they are and learns nothing (the paper's POT).
+
+    Args:
+        tiled: The map; it is not changed.
+        carried: In the map frame.
+        moment: Of the change.
+    """
+    size = tiled.grid.size_m
+    tile_of = np.floor(carried.hinge_mean / size).astype(np.int64)
+    found, member = np.unique(tile_of, axis=0, return_inverse=True)
+    out = {}
+    for number, corner in enumerate(found):
+        index = (int(corner[0]), int(corner[1]), int(corner[2]))
+        new = carried.take(np.flatnonzero(member.reshape(-1) == number)).moved(-corner * size)
+        former = tiled.tiles.get(index)
+        kernels = [former.kernels] if former else []
+        out[index] = Tile(
+            evidence.Rows.empty(),
+            MapKernels.concatenate([*kernels, MapKernels.new(new, CARRIED)]),
+            moment.revision,
+            moment.stamp_ns,
+        )
+    return out
+
+
+def refit(
+    tiled: TiledMap, part: TileIndex, settings: MappingSettings, moment: Moment, *, threads: int
+) -> tuple[dict[TileIndex, Tile], bool]:
+    """Solve the weights of one part's kernels again, those around it held; its tiles, and whether the solve went well.
+
+    Raises:
+        SolverError: the solve ended without numbers.
+    """
+    grid = tiled.grid
+    corner = np.asarray(tiles_of_part(part)[0]) * grid.size_m
+    edge = (np.asarray(tiles_of_part(part)[-1]) + 1) * grid.size_m - corner
+    pad = 4 * grid.coarse_m
+    region = Region.of(tiled, corner - pad, corner + edge + pad, moment.weight_of)
+    start = corner - region.origin_m
+    fitted = _fit(region, start, start + edge, settings, threads)
+    inner = corner + 1e-3 * grid.fine_m, corner + edge - 1e-3 * grid.fine_m
+    tiles = region.tiles(*inner, revision=moment.revision, stamp_ns=moment.stamp_ns)
+    return {index: tile for index, tile in tiles.items() if index in tiled.tiles}, fitted
+
+
+def stalest_part(tiled: TiledMap, moment: Moment) -> TileIndex | None:
+    """The part with the tile that has waited longest to age; none if all are fresh enough, or nothing ages."""
+    if not moment.half_life_s or not tiled.tiles:
+        return None
+    oldest = min(tiled.tiles, key=lambda index: tiled.tiles[index].stamp_ns)
+    return part_of(oldest) if moment.weight_of(tiled.tiles[oldest]) < 0.5**_STALE else None
+
+
+def add_evidence(
+    region: Region,
+    points: Float64,
+    occupied: Bool,
+    weight: Float64 | Float32,
+    source: int,
+    settings: MappingSettings,
+    *,
+    within: tuple[Float64, Float64] | None = None,
+    turn: int = 0,
+) -> evidence.Rows:
+    """Put labelled samples, (N, 3) m in the region's frame, into its rows; the rows that are new.
+
+    Within a box, old rows that say little join others: see `evidence.add_sparing`.
+    """
+    rows, gained, n_old = evidence.add_sparing(
+        region.rows, points, occupied, weight, region.grid.fine_m, source, within=within, turn=turn
+    )
+    evidence.forget(rows.sums, gained, evidence.cells(rows), settings.memory)
+    region.rows = rows
+    return rows.take(slice(n_old, None))
+
+
+def add_kernels(
+    region: Region,
+    new_rows: evidence.Rows,
+    taken: MapKernels,
+    planar: bool,
+    settings: MappingSettings,
+    threads: int,
+) -> MapKernels:
+    """Put kernels where new rows ask for them, beside those that are taken as they are; all that were added."""
+    grid, present = region.grid, region.kernels
+    asking = evidence.positions(new_rows, grid.fine_m)
+    parts = [taken]
+    from_atoms = KernelSet.concatenate([present.kernels.take(present.level == CARRIED), taken.kernels])
+    for level, spacing, within in ((COARSE, grid.coarse_m, _COARSE_REACH), (FINE, grid.fine_m, 0.0)):
+        there = present.kernels.hinge_mean[present.level == level]
+        nodes = new_nodes(
+            asking if level == COARSE else asking[new_rows.occupied],
+            there,
+            spacing,
+            within=within,
+            planar=planar,
+        )
+        same_scale = from_atoms.take(_is_fine(from_atoms, grid) == (level == FINE))
+        if len(same_scale) and len(nodes):
+            nodes = nodes[activation(same_scale, nodes, threads=threads) < _EXPLAINED]
+        parts.append(MapKernels.new(kernels_at(nodes, spacing, settings.prior_var), level))
+    added = MapKernels.concatenate(parts)
+    added = added.take(
+        _fits_budget(
+            present.kernels.hinge_mean, added.kernels.hinge_mean, grid, settings.max_kernels_per_tile
+        )
+    )
+    region.kernels = MapKernels.concatenate([present, added])
+    return added
+
+
+def _wanted(
+    carried: KernelSet, present: MapKernels, points: Float64, grid: TileGrid, threads: int
+) -> KernelSet:
+    """The transported kernels that the map takes: where the scan has data for them and no atom has explained them before.
+
+    Those much wider than the map's own are left out, they would only make the solve harder.
+    """
+    carried = carried.take(carried.gamma >= gamma_of_spacing(_TOO_WIDE * grid.coarse_m))
+    if len(carried) == 0:
+        return carried
+    carried = carried.take(_support(carried, points, grid, threads) >= 1.0)
+    before = present.kernels.take(present.level == CARRIED)
+    explained = np.zeros(len(carried), bool)
+    for fine in (False, True):
+        members = _is_fine(carried, grid) == fine
+        same_scale = before.take(_is_fine(before, grid) == fine)
+        explained[members] = (
+            activation(same_scale, carried.hinge_mean[members], threads=threads) >= _EXPLAINED
+        )
+    return carried.take(~explained)
+
+
+def _support(kernels: KernelSet, points: Float64, grid: TileGrid, threads: int) -> Float32:
+    """(K,) sum of phi over (N, 3) points, for each kernel."""
+    blocks = feature_blocks(
+        points, kernels.hinge_mean, kernels.gamma, edge_m=grid.coarse_m, cut=_REACHED, threads=threads
+    )
+    ones = np.ones(len(points), np.float32)
+    return gradient_and_diagonal(blocks, ones, ones, threads=threads)[0]
+
+
+def _is_fine(kernels: KernelSet, grid: TileGrid) -> Bool:
+    """(K,) which kernels are nearer to the fine lattice's width than to the coarse one's, by ratio."""
+    return kernels.gamma > np.sqrt(gamma_of_spacing(grid.coarse_m) * gamma_of_spacing(grid.fine_m))
+
+
+def _fits_budget(present: Float64, added: Float64, grid: TileGrid, limit: int) -> Bool:
+    """(A,) which added kernels their tile has room for, in their order."""
+    tile = np.floor(np.concatenate([present, added]) / grid.size_m).astype(np.int64)
+    tile -= tile.min(axis=0, initial=0)
+    size = tile.max(axis=0, initial=0) + 1
+    number = np.ravel_multi_index(tuple(tile.T), tuple(size))
+    order = np.argsort(number, kind="stable")
+    first = np.searchsorted(number[order], number[order])
+    place = np.empty(len(number), np.int64)
+    place[order] = np.arange(len(number)) - first
+    return place[len(present) :] < limit
+
+
+def _fit(region: Region, lower: Float64, upper: Float64, settings: MappingSettings, threads: int) -> bool:
+    """Solve the weights of the kernels in a box, those around it held; whether the solve went well.
+
+    Rows and kernels beyond the reach of what is solved for are left out.
+    """
+    grid, kernels = region.grid, region.kernels.kernels
+    pad = grid.coarse_m
+    where = evidence.positions(region.rows, grid.fine_m)
+    rows = np.flatnonzero(
+        inside_box(where, lower - 2 * pad, upper + 2 * pad) & evidence.is_alive(region.rows)
+    )
+    local = np.flatnonzero(inside_box(kernels.hinge_mean, lower - 4 * pad, upper + 4 * pad))
+    hinge = kernels.hinge_mean[local]
+    free = inside_box(hinge, lower, upper)
+    counts = evidence.counts(region.rows.sums, evidence.cells(region.rows), settings.saturation)
+    blocks = feature_blocks(
+        where[rows],
+        hinge,
+        kernels.gamma[local],
+        edge_m=grid.coarse_m,
+        cut=settings.feature_cut,
+        bytes_a_value=1,
+        threads=threads,
+    )
+    per_step = blocks.n_values * (2 + 2 * settings.gradient_steps)
+    cheap = settings.cheap_values // max(per_step, 1)
+    fit = warm_fit(
+        blocks, region.rows.occupied[rows], counts[rows], region.kernels.prior_mean[local],
+        region.kernels.prior_var[local], kernels.weight_mean[local], free=free,
+        n_newton=int(np.clip(cheap, settings.newton_steps, 3 * settings.newton_steps)),
+        n_conjugate_gradient=settings.gradient_steps, longest_step=_LONGEST_STEP, threads=threads,
+    )  # fmt: skip
+    if not (np.isfinite(fit.weights).all() and np.isfinite(fit.var).all()):
+        raise SolverError(f"the weights of {len(local)} kernels on {len(rows)} rows came out NaN or infinite")
+    mean, var = kernels.weight_mean.copy(), kernels.weight_var.copy()
+    solved = local[free]
+    mean[solved], var[solved] = fit.weights[free], fit.var[free]
+    keep = np.ones(len(kernels), bool)
+    keep[local[free & (fit.support < _UNSUPPORTED)]] = False
+    region.kernels = MapKernels(
+        kernels=kernels.replace(weight_mean=mean, weight_var=var),
+        level=region.kernels.level,
+        prior_mean=region.kernels.prior_mean,
+        prior_var=region.kernels.prior_var,
+    ).take(keep)
+    return fit.converged

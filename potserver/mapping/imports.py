@@ -1,0 +1,71 @@
+"""Maps from what other programs know: labelled places become evidence, and kernels are solved on it as on a scan's."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from potserver.domain.kernel_map import KernelMap
+from potserver.domain.map_state import MapState
+from potserver.domain.tiles import Region, TiledMap, TileGrid
+from potserver.domain.types import Bool, Float32, Float64, KernelSet
+from potserver.errors import BadPointsError, EmptyError
+from potserver.mapping.fusion import Moment, add_evidence, append
+from potserver.mapping.service import MappingService
+
+
+def state_of_places(
+    service: MappingService, points: Float64, occupied: Bool, weight: Float32, *, source: str, fine_m: float
+) -> MapState:
+    """The map that knows some places, and nothing else.
+
+    Args:
+        service: An empty one, whose settings count; it makes the map.
+        points: (N, 3) m, map frame.
+        occupied: (N,) labels; false = free.
+        weight: (N,) in looks, a scan's hit is one.
+        source: Whom the evidence is from: a robot's id.
+        fine_m: Resolution wanted, m.
+    Raises:
+        EmptyError: no points. BadPointsError: NaN or infinite coordinates.
+        SolverError: the solve ended without numbers.
+    """
+    if len(points) == 0:
+        raise EmptyError("nothing is known in it: no map can be made")
+    if not np.isfinite(points).all():
+        raise BadPointsError("points have NaN or infinite coordinates")
+    grid = TileGrid.of(service.settings.tile_size_m, fine_m)
+    tiled, number = TiledMap.empty(grid).with_robot(source)
+    tile = np.floor(points / grid.size_m).astype(np.int64)
+    order = np.lexsort(tile.T)
+    cuts = np.flatnonzero((np.diff(tile[order], axis=0) != 0).any(axis=1)) + 1
+    for members in np.split(order, cuts):
+        centre = (tile[members[0]] + 0.5) * grid.size_m
+        region = Region.of(tiled, centre, centre)
+        local = points[members] - region.origin_m
+        add_evidence(region, local, occupied[members], weight[members], number, service.settings)
+        tiled = tiled._replace(
+            tiles={**tiled.tiles, **region.tiles(centre, centre)}
+        )  # without kernels: nothing to index
+    evidence_only = MapState(snapshot=KernelMap(KernelSet.empty()), tiled=tiled)
+    service.merge(evidence_only, np.eye(4))
+    return service.state
+
+
+def state_of_kernels(service: MappingService, kernels: KernelSet) -> MapState:
+    """The map that answers by these kernels, as they are; it has no evidence, so that only profile `paper` goes on from it.
+
+    Args:
+        service: An empty one, whose settings count; it makes the map.
+        kernels: Map frame.
+    Raises:
+        EmptyError: no kernels.
+    """
+    if len(kernels) == 0:
+        raise EmptyError("there are no kernels in it: no map can be made")
+    settings = service.settings
+    tiled = TiledMap.empty(TileGrid.of(settings.tile_size_m, settings.fine_m or 0.2))
+    tiles = append(tiled, kernels, Moment(1, 0))
+    tiled = tiled.with_tiles(tiles, settings.observed_activation)
+    empty = KernelMap(KernelSet.empty(), map_revision=1)
+    service.restore(MapState(snapshot=empty, tiled=tiled))
+    return service.state

@@ -1,0 +1,1 @@
+"""Where maps survive a restart: journal, tiles and saved copies."""

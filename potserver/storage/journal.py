@@ -1,0 +1,176 @@
+"""The journal of a map: every accepted scan, from before it is in the map until a snapshot has it.
+
+scans    a row a scan: its number, and the bytes of `pot.cloud.v1` with pose and robot, and their digest
+head     one row: which scans there must be (`_Head`), and its digest
+"""
+
+from __future__ import annotations
+
+import contextlib
+import secrets
+import sqlite3
+from collections.abc import Iterator
+from pathlib import Path
+
+import msgspec
+
+from potserver.errors import MapFileError
+from potserver.storage.sqlite import Kind, connect, connect_read_only, reading, transaction
+from potserver.storage.tile_codec import DIGEST_BYTES, digest_of
+
+FORMAT = 1
+_KIND = Kind(
+    application_id=0x706F746A,  # "potj"
+    version=FORMAT,
+    schema=(
+        "CREATE TABLE scans (number INTEGER PRIMARY KEY, data BLOB NOT NULL)",
+        "CREATE TABLE head (id INTEGER PRIMARY KEY CHECK (id = 0), content BLOB NOT NULL)",
+    ),
+)
+
+
+class _Head(msgspec.Struct, frozen=True, kw_only=True):
+    store_id: str  # which tiles this is the journal of
+    last: int  # number of the newest scan
+    pruned: int  # scans up to this one may be gone: a snapshot has them
+    closed: bool  # nothing happened since a snapshot took everything in
+
+
+class Journal:
+    """An open journal, which nobody else can open. One caller at a time."""
+
+    def __init__(self, path: Path, *, fsync: bool = True) -> None:
+        """Open or make it.
+
+        Raises:
+            MapFileError: damaged, or of another version. StorageError: another server has it, or the disk refuses.
+        """
+        self._path = path
+        self._connection = connect(path, _KIND, fsync=fsync, exclusive=True)
+        try:
+            with reading(path):
+                found = self._connection.execute("SELECT content FROM head").fetchall()
+            if found:
+                head = self._parse(found[0][0])
+            elif self._has_scans():
+                raise self._damaged("its head", "is missing")
+            else:
+                head = _Head(store_id=secrets.token_hex(8), last=0, pruned=0, closed=True)
+            self.was_closed = head.closed
+            self._head = head
+            with transaction(self._connection, path):
+                self._head = self._put_head(closed=False)
+        except BaseException:
+            self._connection.close()
+            raise
+
+    @property
+    def store_id(self) -> str:
+        """Drawn when the journal was made; the tiles bear it too."""
+        return self._head.store_id
+
+    @property
+    def last(self) -> int:
+        """Number of the newest scan; 0 before the first."""
+        return self._head.last
+
+    @property
+    def pruned(self) -> int:
+        """Scans up to this number may be gone."""
+        return self._head.pruned
+
+    def append(self, cloud: bytes, *, prune_to: int) -> None:
+        """Keep one more scan; it is on the disk when this returns.
+
+        Args:
+            cloud: The scan as `pot.cloud.v1`, with pose and robot.
+            prune_to: Number of the last scan that is in a snapshot: it and those before it are deleted.
+        Raises:
+            StorageError: the disk refuses; the journal is as it was.
+        """
+        number = self._head.last + 1
+        with transaction(self._connection, self._path):
+            self._connection.execute(
+                "INSERT INTO scans VALUES (?, ?)", (number, cloud + _digest(number, cloud))
+            )
+            self._prune(prune_to)
+            head = self._put_head(last=number, pruned=max(prune_to, self.pruned))
+        self._head = head
+
+    def scans(self, after: int) -> Iterator[tuple[int, bytes]]:
+        """The scans with higher numbers than `after`, in order, each checked as it comes.
+
+        Raises:
+            MapFileError: one is missing or damaged.
+        """
+        for number in range(after + 1, self.last + 1):
+            with reading(self._path):
+                row = self._connection.execute(
+                    "SELECT data FROM scans WHERE number = ?", (number,)
+                ).fetchone()
+            data = row[0] if row is not None else b""
+            if not isinstance(data, bytes) or data[-DIGEST_BYTES:] != _digest(number, data[:-DIGEST_BYTES]):
+                raise self._damaged(
+                    f"scan {number} of {self.last}", "is missing or does not fit its checksum"
+                )
+            yield number, data[:-DIGEST_BYTES]
+
+    def close(self, *, complete_to: int | None = None) -> None:
+        """Close; a second time does nothing.
+
+        Args:
+            complete_to: Number of the last scan in a snapshot, if nothing has happened to the map since.
+        Raises:
+            StorageError: the disk refuses the mark that all is complete; the journal is closed as it is.
+        """
+        try:
+            if complete_to is not None and complete_to == self.last:
+                with transaction(self._connection, self._path):
+                    self._prune(complete_to)
+                    self._put_head(pruned=complete_to, closed=True)
+        finally:
+            with contextlib.suppress(sqlite3.Error):
+                self._connection.close()
+
+    def _has_scans(self) -> bool:
+        with reading(self._path):
+            return self._connection.execute("SELECT 1 FROM scans LIMIT 1").fetchone() is not None
+
+    def _prune(self, number: int) -> None:
+        self._connection.execute("DELETE FROM scans WHERE number <= ?", (number,))
+
+    def _put_head(self, **changes: int | bool) -> _Head:
+        head = msgspec.structs.replace(self._head, **changes)
+        content = msgspec.json.encode(head)
+        self._connection.execute("INSERT OR REPLACE INTO head VALUES (0, ?)", (content + digest_of(content),))
+        return head
+
+    def _parse(self, content: object) -> _Head:
+        if not isinstance(content, bytes) or digest_of(content[:-DIGEST_BYTES]) != content[-DIGEST_BYTES:]:
+            raise self._damaged("its head", "does not fit its checksum")
+        try:
+            return msgspec.json.decode(content[:-DIGEST_BYTES], type=_Head)
+        except msgspec.DecodeError as error:
+            raise self._damaged("its head", str(error)) from error
+
+    def _damaged(self, part: str, what: str) -> MapFileError:
+        return MapFileError(
+            f"{self._path} is damaged: {part} {what}. What the last snapshot has can be saved with"
+            f" `potserver map import {self._path.parent} -o NAME.map`; then move the folder away, start, and load it",
+            reason="damaged",
+        )
+
+
+def scans_after(path: Path, number: int) -> int:
+    """How many scans with higher numbers a journal has that nobody has open; it is not changed.
+
+    Raises:
+        MapFileError: it is missing or damaged. StorageError: a server has it open.
+    """
+    with contextlib.closing(connect_read_only(path, _KIND)) as connection, reading(path):
+        row = connection.execute("SELECT COUNT(*) FROM scans WHERE number > ?", (number,)).fetchone()
+    return int(row[0])
+
+
+def _digest(number: int, cloud: bytes) -> bytes:
+    return digest_of(number.to_bytes(8, "little"), cloud)

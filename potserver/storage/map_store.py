@@ -1,0 +1,401 @@
+"""Where a map survives: a journal of accepted scans, and snapshots of the tiles that they made.
+
+A scan is in the journal, on the disk, before it is in the map, and so before anybody is told that it is. Snapshots are
+written beside the writer, from states that never change; what a snapshot has, the journal forgets with its next scan. At the
+start the last snapshot is read and the journal after it is integrated again. Two files, so that a long snapshot never holds up
+a scan; each knows what the other must have, so that one that is lost or old is noticed.
+"""
+
+from __future__ import annotations
+
+import secrets
+import threading
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import NamedTuple
+
+from potserver.adapters import codec
+from potserver.adapters.log import get_logger
+from potserver.adapters.ports import Mapper
+from potserver.adapters.threads import spawn
+from potserver.domain.map_state import MapState
+from potserver.domain.types import Scan
+from potserver.errors import (
+    MapFileError,
+    PotserverError,
+    StorageError,
+    TooLargeError,
+    UnknownMapError,
+    UnsupportedError,
+)
+from potserver.health import Health
+from potserver.storage.journal import Journal
+from potserver.storage.map_file import MapFile, Origin, SavedMap, read_map, write_map
+
+log = get_logger("potserver.store")
+
+JOURNAL, TILES, SAVED = "journal.sqlite", "tiles.sqlite", "saved"
+_REPORT_S = 2.0  # between two lines of progress
+_IN_MEMORY = "this server keeps its maps in memory only: start it with --store DIR, or without --in-memory"
+
+
+class Restored(NamedTuple):
+    """What a start found."""
+
+    n_scans: int  # in the map now
+    n_replayed: int  # of those, from the journal
+    stamps: dict[str, int]  # newest accepted stamp of each robot, ns
+
+
+class _Newest(NamedTuple):
+    """A state of the map, and where in the journal it stands."""
+
+    state: MapState
+    stamps: Mapping[str, int]
+    number: int
+
+
+class MapStore:
+    """One map's folder; all methods have one caller at a time, the map's writer."""
+
+    durable = True  # what was appended survives this process
+
+    def __init__(
+        self,
+        folder: Path,
+        map_id: str,
+        *,
+        keeps_evidence: bool,
+        health: Health,
+        fsync: bool = True,
+        snapshot_scans: int = 50,
+        snapshot_bytes: int = 64 * 2**20,
+        max_saved: int = 100,
+    ) -> None:
+        """Open the folder `<folder>/<map_id>`, or make it.
+
+        Args:
+            folder: Of all maps of a server.
+            map_id: Of this one.
+            keeps_evidence: Whether the map keeps rows, and not only kernels: a map of the other kind is refused.
+            health: Gets counts and times.
+            fsync: Wait for the disk with each scan; without, a crash of the machine, though not of the process, may take
+                the last ones.
+            snapshot_scans, snapshot_bytes: Of the journal, after which a snapshot is written.
+            max_saved: Copies with a name that may lie in the folder `saved` of all maps.
+        Raises:
+            StorageError: another server has the folder, or the disk refuses.
+            MapFileError: a file in it is damaged, or of another version.
+        """
+        self.folder = folder / map_id
+        self._saved = folder / SAVED
+        self._map_id, self._keeps_evidence, self._health = map_id, keeps_evidence, health
+        self._snapshot_scans, self._snapshot_bytes = snapshot_scans, snapshot_bytes
+        self._max_saved = max_saved
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise StorageError(
+                f"cannot make the map's folder {self.folder}: {error.strerror or error}; name another one (--store), or"
+                " keep the map in memory (--in-memory)"
+            ) from error
+        self._journal = Journal(self.folder / JOURNAL, fsync=fsync)
+        try:
+            self._tiles = MapFile(self.folder / TILES, fsync=fsync)
+        except BaseException:
+            self._journal.close()
+            raise
+        self._number = self._journal.last
+        self._taken = 0  # number of the last scan that is in a snapshot
+        self._unsaved_bytes = 0  # of the journal, since the last snapshot that was asked for
+        self._asked = 0  # number that the last snapshot was asked for at
+        self._newest: _Newest | None = None
+        self._written: MapState | None = None  # what the last snapshot holds
+        self._changed = threading.Condition()
+        self._writing = threading.Lock()  # one snapshot at a time
+        self._wanted = self._closed = False
+        self._thread = spawn(f"{map_id}-snapshots", self._run)
+
+    # --- start ----------------------------------------------------------------------------------------------
+
+    def restore(self, mapper: Mapper) -> Restored:
+        """Give an empty mapper the map that is kept: the last snapshot, and the scans of the journal after it.
+
+        Raises:
+            MapFileError: something that must be there is damaged or missing, or the settings do not fit the map.
+        """
+        started_s = time.perf_counter()
+        saved = self._tiles.read(mapper.settings.observed_activation)
+        self._check_whole(saved)
+        stamps: dict[str, int] = {}
+        if saved is not None:
+            stamps.update(saved.record.stamps)
+            self._taken = saved.record.number
+            # scans may be integrated a little otherwise than before, and numbers of revisions must not come twice
+            keeps_epoch = self._journal.was_closed and self._journal.last == self._taken
+            epoch = saved.record.epoch if keeps_epoch else secrets.randbits(62)
+            self._check_fits(mapper, saved, self._tiles.path)
+            mapper.restore(saved.state(epoch=epoch))
+            if keeps_epoch:
+                self._written = mapper.state
+        n_replayed = self._replay(mapper, stamps)
+        self._number = max(self._journal.last, self._taken)
+        self._asked = self._taken
+        self._newest = _Newest(mapper.state, dict(stamps), self._number)
+        log.info(
+            "map_restored",
+            map_id=self._map_id,
+            folder=str(self.folder),
+            n_scans=mapper.n_scans,
+            n_replayed=n_replayed,
+            map_revision=mapper.state.map_revision,
+            elapsed_ms=round((time.perf_counter() - started_s) * 1e3, 1),
+        )
+        return Restored(mapper.n_scans, n_replayed, stamps)
+
+    def _check_whole(self, saved: SavedMap | None) -> None:
+        """The two files must be of one store, and meet."""
+        number, store_id = (0, "") if saved is None else (saved.record.number, saved.record.store_id)
+        way_out = (
+            f"move {self.folder} away, start with an empty map, and load a saved copy (`potclient map load NAME`);"
+            f" `potserver map import {self.folder} -o NAME.map` makes one of the last snapshot"
+        )
+        if store_id not in ("", self._journal.store_id):
+            raise MapFileError(
+                f"{self.folder}: {JOURNAL} is missing or of another map than {TILES}; {way_out}",
+                reason="damaged",
+            )
+        if number < self._journal.pruned:
+            raise MapFileError(
+                f"{self.folder}: {TILES} is missing or too old: it has the scans up to {number}, and {JOURNAL} only those"
+                f" after {self._journal.pruned}; {way_out}",
+                reason="damaged",
+            )
+
+    def _replay(self, mapper: Mapper, stamps: dict[str, int]) -> int:
+        n = self._journal.last - self._taken
+        if n > 0:
+            log.info("journal_replaying", map_id=self._map_id, n_scans=n)
+        reported_s = time.monotonic()
+        done = 0
+        for number, payload in self._journal.scans(self._taken):
+            try:
+                scan = codec.read_cloud(payload)
+                mapper.integrate(scan)
+            except PotserverError as error:
+                raise MapFileError(
+                    f"{self.folder}: scan {number} of the journal, which was accepted, cannot be integrated again: {error}."
+                    " Start with the settings that it was accepted with",
+                    reason="settings",
+                ) from error
+            self._unsaved_bytes += len(payload)
+            stamps[scan.robot_id] = max(scan.stamp_ns, stamps.get(scan.robot_id, 0))
+            done += 1
+            if time.monotonic() - reported_s > _REPORT_S:
+                reported_s = time.monotonic()
+                log.info("journal_replaying", map_id=self._map_id, n_scans=n, n_done=done)
+        return done
+
+    # --- scans ----------------------------------------------------------------------------------------------
+
+    def append(self, scan: Scan) -> None:
+        """Keep a scan that is about to enter the map; it is on the disk when this returns.
+
+        Raises:
+            StorageError: the disk refuses; the scan must not enter the map.
+        """
+        started_s = time.perf_counter()
+        payload = codec.encode_cloud(scan)
+        try:
+            self._journal.append(payload, prune_to=self._taken)
+        except StorageError:
+            self._health.count("store.appends_failed")
+            raise
+        self._number = self._journal.last
+        self._unsaved_bytes += len(payload)
+        self._health.count("store.appends")
+        self._health.observe("journal", (time.perf_counter() - started_s) * 1e3)
+
+    def advance(self, mapper: Mapper, stamps: Mapping[str, int]) -> None:
+        """The last scan is in the map; a snapshot is begun if enough have come. Never waits.
+
+        Args:
+            mapper: With it.
+            stamps: Newest accepted stamp of each robot, ns.
+        """
+        with self._changed:
+            self._newest = _Newest(mapper.state, dict(stamps), self._number)
+            due = self._number - self._asked >= self._snapshot_scans
+            if due or self._unsaved_bytes >= self._snapshot_bytes:
+                self._asked, self._unsaved_bytes = self._number, 0
+                self._wanted = True
+                self._changed.notify_all()
+
+    # --- maps -----------------------------------------------------------------------------------------------
+
+    def replace(self, state: MapState, stamps: Mapping[str, int]) -> None:
+        """Write a snapshot of a state that is about to become the map; it is on the disk when this returns.
+
+        Raises:
+            StorageError: the disk refuses; what was kept before still is, and the state must not become the map.
+        """
+        with self._writing:
+            newest = _Newest(state, dict(stamps), self._number)
+            self._write(newest)
+            with self._changed:
+                self._newest = newest
+                self._asked, self._unsaved_bytes = self._number, 0
+
+    def save(self, name: str | None, mapper: Mapper, stamps: Mapping[str, int]) -> str:
+        """Write a snapshot now, and a file of its own if there is a name; what was done, for people.
+
+        Raises:
+            StorageError: the disk refuses. TooLargeError: there are as many files as may be.
+        """
+        state = mapper.state
+        self.replace(state, stamps)
+        if name is None:
+            return f"the snapshot holds all {state.n_scans} scans"
+        path = self._saved / f"{name}.map"
+        others = [p for p in self._saved.glob("*.map") if p != path]
+        if len(others) >= self._max_saved:
+            raise TooLargeError(
+                f"{len(others)} maps are saved already, the limit is {self._max_saved} (store.max_saved)"
+            )
+        n_bytes = write_map(path, state, Origin(self._map_id, self._keeps_evidence, stamps))
+        self._health.count("store.saved")
+        return f"{state.n_scans} scans saved as {path}, {n_bytes} bytes"
+
+    def load(self, name: str, mapper: Mapper) -> tuple[MapState, dict[str, int]]:
+        """Read a saved map: the state to replace the present one with, of a new epoch and a higher revision, and its stamps.
+
+        Raises:
+            UnknownMapError: none was saved under that name.
+            MapFileError: it is damaged, of another version, or does not fit the settings.
+        """
+        path = self._saved / f"{name}.map"
+        if not path.is_file():
+            names = ", ".join(sorted(p.stem for p in self._saved.glob("*.map"))) or "none"
+            raise UnknownMapError(f"no map was saved as {name!r}; there are: {names}")
+        saved = read_map(path, mapper.settings.observed_activation)
+        self._check_fits(mapper, saved, path)
+        revision = max(mapper.state.map_revision, saved.record.revision) + 1
+        return saved.state(epoch=secrets.randbits(62), revision=revision), dict(saved.record.stamps)
+
+    # --- end ------------------------------------------------------------------------------------------------
+
+    def close(self) -> bool:
+        """Write a last snapshot if the map has changed since the one before, and close; false if the disk refused."""
+        with self._changed:
+            self._closed = True
+            self._changed.notify_all()
+        self._thread.join()
+        complete_to = None
+        try:
+            newest = self._newest
+            # a scan that is in the journal and not in the map is the next start's
+            if newest is not None and newest.number == self._number:
+                if newest.state is not self._written:
+                    self._write(newest)
+                complete_to = newest.number
+            self._journal.close(complete_to=complete_to)
+            return True
+        except StorageError as error:
+            log.error(
+                "last_snapshot_failed", map_id=self._map_id, detail=str(error)
+            )  # the journal has it all
+            return False
+        finally:
+            self._tiles.close()
+            self._journal.close()
+
+    def _run(self) -> None:
+        """Write the snapshots that `advance` asks for."""
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._wanted or self._closed)
+                if self._closed:
+                    return
+                self._wanted = False
+            with self._writing:
+                newest = self._newest  # inside: `replace` may just have written a newer one
+                try:
+                    if newest is not None:
+                        self._write(newest)
+                except StorageError as error:
+                    # the scans are safe in the journal, which grows until a snapshot succeeds
+                    self._health.count("store.snapshots_failed")
+                    log.warning("snapshot_failed", map_id=self._map_id, detail=str(error))
+                except Exception:  # a bug must not end the thread
+                    self._health.count("store.snapshots_failed")
+                    log.exception("snapshot_failed", map_id=self._map_id)
+
+    def _write(self, newest: _Newest) -> None:
+        started_s = time.perf_counter()
+        origin = Origin(
+            self._map_id, self._keeps_evidence, newest.stamps, self._journal.store_id, newest.number
+        )
+        n_bytes = self._tiles.write(newest.state, origin)
+        self._taken, self._written = newest.number, newest.state
+        elapsed_ms = (time.perf_counter() - started_s) * 1e3
+        self._health.count("store.snapshots")
+        self._health.observe("snapshot", elapsed_ms)
+        log.info(
+            "snapshot_written",
+            map_id=self._map_id,
+            n_scans=newest.state.n_scans,
+            map_revision=newest.state.map_revision,
+            n_bytes=n_bytes,
+            elapsed_ms=round(elapsed_ms, 1),
+        )
+
+    def _check_fits(self, mapper: Mapper, saved: SavedMap, path: Path) -> None:
+        r, size_m = saved.record, mapper.settings.tile_size_m
+        if r.grid is not None and r.grid[0] != size_m:
+            raise MapFileError(
+                f"{path} has tiles of {r.grid[0]} m, and mapping.tile_size_m is {size_m}: set it to the map's",
+                reason="settings",
+            )
+        if r.n_tiles and r.keeps_evidence != self._keeps_evidence:
+            kinds = ("kernels alone (profile `paper`)", "evidence")
+            raise MapFileError(
+                f"{path} is a map of {kinds[r.keeps_evidence]}, this server makes maps of {kinds[self._keeps_evidence]}:"
+                " choose the other profile",
+                reason="settings",
+            )
+
+
+class MemoryOnly:
+    """Keeps nothing: the store of a map that lives in memory."""
+
+    durable = False
+
+    def append(self, scan: Scan) -> None:
+        """Nothing to do."""
+
+    def advance(self, mapper: Mapper, stamps: Mapping[str, int]) -> None:
+        """Nothing to do."""
+
+    def replace(self, state: MapState, stamps: Mapping[str, int]) -> None:
+        """Nothing to do."""
+
+    def save(self, name: str | None, mapper: Mapper, stamps: Mapping[str, int]) -> str:
+        """Not here.
+
+        Raises:
+            UnsupportedError: always.
+        """
+        raise UnsupportedError(_IN_MEMORY)
+
+    def load(self, name: str, mapper: Mapper) -> tuple[MapState, dict[str, int]]:
+        """Not here.
+
+        Raises:
+            UnsupportedError: always.
+        """
+        raise UnsupportedError(_IN_MEMORY)
+
+    def close(self) -> bool:
+        """Nothing to do."""
+        return True

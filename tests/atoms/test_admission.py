@@ -1,0 +1,233 @@
+"""Which atoms may join a dictionary, and how far apart atoms are."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from potschemas import keys
+from potserver.atoms.admission import AdmissionSettings, Refusal, admit, own_auc
+from potserver.atoms.distance import atom_distances, near_in_spread
+from potserver.domain.dictionary import AtomDictionary
+from potserver.domain.types import Atom, KernelSet
+from potserver.errors import AtomRefusedError, SettingsError
+
+
+@pytest.fixture(scope="module")
+def builtin() -> AtomDictionary:
+    return AtomDictionary.builtin()
+
+
+@pytest.fixture(scope="module")
+def atom(builtin: AtomDictionary) -> Atom:
+    """A sound 3D atom."""
+    return builtin.of_dims(3).atoms[-1]
+
+
+@pytest.fixture(scope="module")
+def flat(builtin: AtomDictionary) -> Atom:
+    """A sound 2D atom."""
+    return builtin.of_dims(2).atoms[0]
+
+
+def _refusal(atom: Atom, dictionary: AtomDictionary | None = None, **settings: Any) -> AtomRefusedError:
+    with pytest.raises(AtomRefusedError) as caught:
+        admit(atom, dictionary or AtomDictionary(), AdmissionSettings(**settings))
+    return caught.value
+
+
+def _kernels(atom: Atom, **arrays: Any) -> Atom:
+    return dataclasses.replace(atom, kernels=atom.kernels.replace(**arrays))
+
+
+def _with(array: np.ndarray, row: Any, value: Any) -> np.ndarray:
+    changed = array.copy()
+    changed[row] = value
+    return changed
+
+
+def _first_kernel(**numbers: Any) -> Callable[[Atom], Atom]:
+    """Makes atoms whose first kernel has these numbers."""
+
+    def change(atom: Atom) -> Atom:
+        return _kernels(atom, **{n: _with(getattr(atom.kernels, n), 0, v) for n, v in numbers.items()})
+
+    return change
+
+
+# --- admission ----------------------------------------------------------------------------------------------
+
+
+def test_every_built_in_atom_would_be_taken_again(builtin: AtomDictionary) -> None:
+    for atom in builtin:
+        admit(atom, builtin.remove(atom.atom_id))
+
+
+@pytest.mark.parametrize("atom_id", ["", "A", "a/b", "-a", "a" * 64, "../a", "a\n", "é"])
+def test_an_illegal_id(atom: Atom, atom_id: str) -> None:
+    with pytest.raises(ValueError):
+        keys.check_id(atom_id, "atom")  # the same rule as that of all ids on the wire
+    error = _refusal(dataclasses.replace(atom, atom_id=atom_id))
+    assert error.reason == Refusal.ILLEGAL_ID
+    assert error.code == "atom_refused"
+
+
+def test_a_taken_id_and_a_full_dictionary(atom: Atom, flat: Atom) -> None:
+    error = _refusal(atom, AtomDictionary([dataclasses.replace(flat, atom_id=atom.atom_id)]))
+    assert error.reason == Refusal.TAKEN_ID
+    assert _refusal(atom, AtomDictionary([flat]), max_atoms=1).reason == Refusal.FULL
+
+
+_BROKEN: dict[str, tuple[Refusal, Callable[[Atom], Atom]]] = {
+    "long provenance": (
+        Refusal.BAD_PROVENANCE,
+        lambda a: dataclasses.replace(a, provenance={"source": "x" * 5000}),
+    ),
+    "no radius": (Refusal.BAD_SECTOR, lambda a: dataclasses.replace(a, radius_m=0.0)),
+    "nan radius": (Refusal.BAD_SECTOR, lambda a: dataclasses.replace(a, radius_m=float("nan"))),
+    "huge radius": (Refusal.BAD_SECTOR, lambda a: dataclasses.replace(a, radius_m=1e4)),
+    "more than a circle": (Refusal.BAD_SECTOR, lambda a: dataclasses.replace(a, azimuth_width_rad=6.4)),
+    "no hits": (Refusal.NO_POINTS, lambda a: dataclasses.replace(a, hit_points=a.hit_points[:0])),
+    "no free points": (Refusal.NO_POINTS, lambda a: dataclasses.replace(a, free_points=a.free_points[:0])),
+    "too many hits": (
+        Refusal.TOO_MANY_POINTS,
+        lambda a: dataclasses.replace(a, hit_points=np.repeat(a.hit_points, 100, axis=0)),
+    ),
+    "no kernels": (Refusal.NO_KERNELS, lambda a: dataclasses.replace(a, kernels=KernelSet.empty())),
+    "too many kernels": (
+        Refusal.TOO_MANY_KERNELS,
+        lambda a: dataclasses.replace(a, kernels=KernelSet.concatenate([a.kernels] * 100)),
+    ),
+    "a hit beyond the radius": (
+        Refusal.POINTS_OUTSIDE,
+        lambda a: dataclasses.replace(a, hit_points=_with(a.hit_points, 0, [10.2, 0, 0])),
+    ),
+    "a hit beside the sector": (
+        Refusal.POINTS_OUTSIDE,
+        lambda a: dataclasses.replace(a, hit_points=_with(a.hit_points, 0, [3, 3, 0])),
+    ),
+    "a free point behind the sensor": (
+        Refusal.POINTS_OUTSIDE,
+        lambda a: dataclasses.replace(a, free_points=_with(a.free_points, 0, [-0.2, 0, 0])),
+    ),
+    "a free point high above": (
+        Refusal.POINTS_OUTSIDE,
+        lambda a: dataclasses.replace(a, free_points=_with(a.free_points, 0, [3, 0, 50])),
+    ),
+    "a kernel far away": (Refusal.KERNELS_OUTSIDE, _first_kernel(hinge_mean=[14, 0, 0])),
+    "a kernel at no place": (Refusal.KERNELS_OUTSIDE, _first_kernel(hinge_mean=[1e308, 1e308, 0])),
+    "a huge weight": (Refusal.WILD_KERNELS, _first_kernel(weight_mean=1e4)),
+    "a weight without doubt": (Refusal.WILD_KERNELS, _first_kernel(weight_var=0)),
+    "a weight without knowledge": (Refusal.WILD_KERNELS, _first_kernel(weight_var=1e6)),
+    "a needle": (Refusal.WILD_KERNELS, _first_kernel(gamma_rate=1e-30)),
+    "a kernel as wide as the world": (Refusal.WILD_KERNELS, _first_kernel(gamma_rate=1e30)),
+    "a hinge that may be anywhere": (Refusal.WILD_KERNELS, _first_kernel(hinge_var=1e6)),
+    "weights of the wrong sign": (
+        Refusal.UNEXPLAINED,
+        lambda a: _kernels(a, weight_mean=-a.kernels.weight_mean),
+    ),
+    "weights that say nothing": (
+        Refusal.UNEXPLAINED,
+        lambda a: _kernels(a, weight_mean=np.zeros_like(a.kernels.weight_mean)),
+    ),
+}
+
+
+@pytest.mark.parametrize("name", _BROKEN)
+def test_a_broken_atom_is_refused_with_its_reason(atom: Atom, name: str) -> None:
+    refusal, break_it = _BROKEN[name]
+    error = _refusal(break_it(atom))
+    assert error.reason == refusal.value, error
+
+
+def test_an_atom_of_two_dimensions_lies_in_its_plane(flat: Atom) -> None:
+    admit(flat, AtomDictionary())
+    error = _refusal(dataclasses.replace(flat, hit_points=_with(flat.hit_points, 0, [3, 0, 0.5])))
+    assert error.reason == Refusal.POINTS_OUTSIDE
+
+
+def test_what_is_there_already_is_refused_whatever_its_name(builtin: AtomDictionary) -> None:
+    rng = np.random.default_rng(0)
+    for atom in builtin.of_dims(3).atoms[::6]:
+        moved = (atom.hit_points + rng.normal(0, 0.02, atom.hit_points.shape)).astype(np.float32)
+        inside = np.hypot(moved[:, 0], moved[:, 1]) < atom.radius_m
+        again = dataclasses.replace(atom, atom_id="again", hit_points=moved[inside])
+        error = _refusal(again, builtin)
+        assert error.reason == Refusal.DUPLICATE
+        assert repr(atom.atom_id) in str(error)
+
+
+def test_twins_of_other_dimensions_do_not_count(flat: Atom) -> None:
+    twin = dataclasses.replace(flat, atom_id="twin", dims=3)
+    admit(twin, AtomDictionary([flat]))
+    assert (
+        _refusal(dataclasses.replace(flat, atom_id="twin"), AtomDictionary([flat])).reason
+        == Refusal.DUPLICATE
+    )
+
+
+def test_the_settings_are_checked() -> None:
+    with pytest.raises(SettingsError, match=r"atoms\.admission\.min_auc"):
+        AdmissionSettings(min_auc=float("nan"))
+    with pytest.raises(SettingsError, match="max_points"):
+        AdmissionSettings(max_points=-1)
+
+
+def test_own_auc_against_counting_pairs(flat: Atom) -> None:
+    kernels = flat.kernels
+    scores = []
+    for points in (flat.hit_points, flat.free_points):
+        d2 = np.square(points[:, None].astype(np.float64) - kernels.hinge_mean).sum(axis=2)
+        scores.append(np.exp(-kernels.gamma.astype(np.float64) * d2) @ kernels.weight_mean)
+    hits, free = scores
+    wins = (hits[:, None] > free).mean() + 0.5 * (hits[:, None] == free).mean()
+    assert own_auc(flat) == pytest.approx(wins, abs=2e-3)
+    silent = _kernels(flat, weight_mean=np.zeros_like(kernels.weight_mean))
+    assert own_auc(silent) == 0.5
+
+
+# --- distances ----------------------------------------------------------------------------------------------
+
+
+def test_distances_are_symmetric_and_find_the_equal_one(builtin: AtomDictionary) -> None:
+    atoms = list(builtin.of_dims(2))[:6]
+    distances = atom_distances(atoms, atoms)
+    assert distances.shape == (6, 6)
+    np.testing.assert_allclose(distances, distances.T, rtol=2e-2)
+    assert (distances.argmin(axis=1) == np.arange(6)).all()
+    np.testing.assert_allclose(atom_distances(atoms[:2], atoms, threads=2), distances[:2], rtol=1e-6)
+
+
+def test_equal_atoms_have_equal_distances(builtin: AtomDictionary) -> None:
+    a, b = builtin.atoms[:2]
+    twin = dataclasses.replace(a, atom_id="twin")
+    distances = atom_distances([a, twin], [a, twin, b])
+    assert (distances[0] == distances[1]).all()
+    assert distances[0, 0] == distances[0, 1]
+
+
+def test_a_label_that_only_one_atom_has_cannot_be_compared(flat: Atom) -> None:
+    no_hits = dataclasses.replace(flat, atom_id="a", hit_points=flat.hit_points[:0])
+    no_free = dataclasses.replace(flat, atom_id="b", free_points=flat.free_points[:0])
+    distances = atom_distances([flat, no_hits, no_free], [flat, no_hits, no_free])
+    assert np.isfinite(distances).tolist() == np.eye(3, dtype=bool).tolist()
+    assert atom_distances([], [flat]).shape == (0, 1)
+
+
+def test_the_quick_bound_never_rules_out_a_near_one(builtin: AtomDictionary) -> None:
+    atoms = list(builtin.of_dims(3))
+    distances = atom_distances(atoms, atoms)
+    ruled_out = 0
+    for i, one in enumerate(atoms):
+        assert near_in_spread(one, one, 1e-9)
+        for j, other in enumerate(atoms):
+            limit_m2 = (
+                float(distances[i, j]) * 1.5
+            )  # the entropic distance is above the true one, but for thinning
+            assert near_in_spread(one, other, limit_m2)
+            ruled_out += not near_in_spread(one, other, 0.25)
+    assert ruled_out > len(atoms) ** 2 / 2

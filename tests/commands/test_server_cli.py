@@ -1,0 +1,276 @@
+"""The command line: flags to settings, output, exit codes, and no traceback for a user's mistake."""
+
+from __future__ import annotations
+
+import io
+import json
+import logging
+import os
+import signal
+import sys
+import types
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from potclient.atoms import Atom
+from potserver import cli
+from potserver.adapters.log import configure_logging, get_logger
+from potserver.config import Settings, load_settings
+from potserver.domain.dictionary import AtomDictionary
+
+
+@pytest.fixture(autouse=True)
+def no_variables(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in list(os.environ):
+        if name.startswith(("POTSERVER_", "ZENOH_")):
+            monkeypatch.delenv(name)
+
+
+@pytest.fixture(autouse=True)
+def keep_logging() -> Iterator[None]:
+    root, ours = logging.getLogger(), logging.getLogger("potserver")
+    before = root.handlers[:], root.level, ours.level
+    yield
+    root.handlers[:] = before[0]
+    root.setLevel(before[1])
+    ours.setLevel(before[2])
+
+
+def show(capsys: pytest.CaptureFixture[str], *flags: str) -> dict[str, Any]:
+    assert cli.main(["config", "show", "--json", *flags]) == 0
+    tree: dict[str, Any] = json.loads(capsys.readouterr().out)
+    return tree
+
+
+def test_config_show_prints_a_file_that_can_be_read_back(
+    capsys: pytest.CaptureFixture[str], tmp_path: Any
+) -> None:
+    assert cli.main(["config", "show", "--map", "a", "--map", "b"]) == 0
+    file = tmp_path / "settings.toml"
+    file.write_text(capsys.readouterr().out)
+    assert load_settings(file=file).maps == ("a", "b")
+
+
+def test_flags_become_settings(capsys: pytest.CaptureFixture[str]) -> None:
+    tree = show(
+        capsys,
+        *("-m", "router", "-e", "tcp/h:1", "-e", "tcp/h:2", "-l", "tcp/127.0.0.1:0", "-c", "z.json5"),
+        *("--cfg", "transport/link/tx/lease:5000", "--cfg", 'connect/endpoints:["tcp/h:3"]', "--no-shm"),
+        *("--server-id", "s1", "--root", "r", "--profile", "paper", "--threads", "2", "--drain-timeout", "3"),
+        *("--log-level", "debug", "--log-format", "json", "--dictionary", "d.npz"),
+        *("--set", "limits.max_cloud_points=7", "--set", "intake.robots=r1,r2"),
+    )
+    assert tree["zenoh"] == {
+        "mode": "router",
+        "connect": ["tcp/h:1", "tcp/h:2"],
+        "listen": ["tcp/127.0.0.1:0"],
+        "config": "z.json5",
+        "cfg": {"transport/link/tx/lease": "5000", "connect/endpoints": '["tcp/h:3"]'},
+        "shared_memory": False,
+        "shared_memory_queries": False,
+    }
+    assert (tree["server_id"], tree["root"], tree["threads"]) == ("s1", "r", 2)
+    assert (tree["drain_timeout_s"], tree["dictionary"]) == (3.0, "d.npz")
+    assert tree["mapping"]["profile"] == "paper"
+    assert tree["log"] == {"level": "debug", "format": "json"}
+    assert tree["limits"]["max_cloud_points"] == 7
+    assert tree["intake"]["robots"] == ["r1", "r2"]
+
+
+def test_variables_are_read(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("POTSERVER_SEED", "9")
+    assert show(capsys)["seed"] == 9
+    assert show(capsys, "--set", "seed=10")["seed"] == 10
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["config", "show", "--set", "nothing=1"], "no setting 'nothing'"),
+        (["config", "show", "--set", "seed"], "need KEY=VALUE"),
+        (["config", "show", "--cfg", "mode"], "need KEY:VALUE"),
+        (["config", "show", "--settings", "/no/such.toml"], "cannot read settings file"),
+        (["config", "show", "--root", "**"], "chunks"),
+        (["atoms", "info", "/no/such.atoms"], "no atom dictionary at"),
+        (["atoms", "build", "-o", "x.npz"], "recordings to learn from"),
+        (["atoms", "info", "--picture", "/no/such/folder/x.png", "--limit", "0"], "cannot draw 0 atoms"),
+        (["atoms", "export", "nope", "-o", "x"], "no atom 'nope'"),
+        (["atoms", "import", "/no/such.atom", "-o", "/no/such.atoms"], "cannot read /no/such.atom"),
+        (["config", "show", "--set", "atoms.save=true"], "need the setting `dictionary`"),
+        (["config", "show", "--set", "atoms.admission.min_auc=nan"], "atoms.admission.min_auc"),
+        (["serve", "--map", "A"], "is not an id"),
+    ],
+)
+def test_a_mistake_is_one_line_and_exit_code_two(
+    capsys: pytest.CaptureFixture[str], arguments: list[str], message: str
+) -> None:
+    assert cli.main(arguments) == 2
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err.startswith("potserver: ")
+    assert captured.err.count("\n") == 1
+    assert message in captured.err
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        [],
+        ["serve"],
+        ["config"],
+        ["config", "show"],
+        ["atoms"],
+        ["atoms", "info"],
+        ["atoms", "build"],
+        ["atoms", "export"],
+        ["atoms", "import"],
+        ["eval"],
+    ],
+)
+def test_help_is_there_at_every_level(capsys: pytest.CaptureFixture[str], words: list[str]) -> None:
+    with pytest.raises(SystemExit) as caught:
+        cli.main([*words, "--help"])
+    assert caught.value.code == 0
+    text = capsys.readouterr().out
+    assert f"usage: {' '.join(['potserver', *words])}" in text
+    assert max(len(line) for line in text.splitlines()) <= 120
+
+
+def test_no_command_is_help_and_an_error(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main([]) == 2
+    assert "usage: potserver" in capsys.readouterr().out
+
+
+def test_atoms_info_lists_the_dictionary(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["atoms", "info", "--json"]) == 0
+    atoms = json.loads(capsys.readouterr().out)
+    assert {atom["dims"] for atom in atoms} == {2, 3}
+    assert all(atom["provenance"] for atom in atoms)
+    assert cli.main(["atoms", "info"]) == 0
+    text = capsys.readouterr().out
+    assert text.splitlines()[-1].startswith(f"{len(atoms)} atoms, ")
+    head, first = text.splitlines()[:2]
+    assert head.split()[:8] == ["atom", "dims", "hits", "free", "kernels", "AUC", "NLL", "ECE"]
+    assert first.startswith(atoms[0]["atom_id"])
+    assert atoms[0]["provenance"]["held_out_auc"] in first
+
+
+def test_atoms_info_draws_a_picture(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    picture = tmp_path / "atoms.png"
+    assert cli.main(["atoms", "info", "--picture", str(picture), "--limit", "1"]) == 0
+    assert f"1 atoms drawn to {picture}" in capsys.readouterr().out
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    name = AtomDictionary.builtin().of_dims(2).atoms[0].atom_id
+    assert cli.main(["atoms", "info", "--picture", "/no/such/folder/x.png", "--atom", name]) == 2
+    assert "cannot write" in capsys.readouterr().err
+
+
+def test_atoms_leave_a_dictionary_and_come_back(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    builtin = AtomDictionary.builtin()
+    names = [atom.atom_id for atom in builtin][:2]
+    assert cli.main(["atoms", "export", *names, "-o", str(tmp_path / "out")]) == 0
+    files = [str(tmp_path / "out" / f"{name}.atom") for name in names]
+    assert Atom.load(files[0]).info.atom_id == names[0]  # robots read the same files
+    target = tmp_path / "mine.atoms"
+    assert cli.main(["atoms", "import", files[0], "-o", str(target)]) == 0
+    assert cli.main(["atoms", "import", files[1], "-o", str(target)]) == 0
+    back = AtomDictionary.load(target)
+    assert [atom.atom_id for atom in back] == names
+    np.testing.assert_allclose(
+        back.get(names[0]).kernels.hinge_mean, builtin.get(names[0]).kernels.hinge_mean, atol=2e-6
+    )
+    before = target.read_bytes()
+    capsys.readouterr()
+    assert cli.main(["atoms", "import", files[0], "-o", str(target)]) == 2
+    assert "the dictionary has an atom" in capsys.readouterr().err
+    assert target.read_bytes() == before
+
+
+def test_demo_is_handed_its_arguments(monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: list[list[str]] = []
+    demo = types.ModuleType("potserver.commands.demo")
+    demo.main = lambda arguments: seen.append(arguments)  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "potserver.commands.demo", demo)
+    assert cli.main(["demo", "--help", "-x"]) == 0
+    assert seen == [["--help", "-x"]]
+
+
+def test_the_first_signal_sets_a_flag_and_handlers_are_put_back() -> None:
+    before = signal.getsignal(signal.SIGTERM), signal.getsignal(signal.SIGINT)
+    with cli._StopSignals.installed() as stop:
+        assert stop.name is None
+        signal.raise_signal(signal.SIGTERM)
+        stop.wait()
+        assert stop.name == "SIGTERM"
+    assert (signal.getsignal(signal.SIGTERM), signal.getsignal(signal.SIGINT)) == before
+
+
+# --- the log ------------------------------------------------------------------------------------------------
+
+
+def test_events_are_json_lines_with_their_fields() -> None:
+    stream = io.StringIO()
+    configure_logging("info", "auto", stream)  # not a terminal
+    log = get_logger("potserver.test")
+    log.info("scan_integrated", n_tiles=3, map_id="default")
+    log.debug("not_shown")
+    try:
+        raise ZeroDivisionError("x")
+    except ZeroDivisionError:
+        log.exception("scan_failed")
+    logging.getLogger("zenoh.handlers").error("callback error")
+    integrated, failed, foreign = (json.loads(line) for line in stream.getvalue().splitlines())
+    assert (integrated["event"], integrated["n_tiles"], integrated["level"]) == ("scan_integrated", 3, "info")
+    assert "timestamp" in integrated
+    assert "ZeroDivisionError" in failed["exception"]
+    assert foreign["event"] == "callback error"
+
+
+def test_on_a_console_they_are_for_people() -> None:
+    stream = io.StringIO()
+    configure_logging("debug", "console", stream)
+    get_logger("potserver.test").debug("scan_integrated", n_tiles=3)
+    assert "scan_integrated" in stream.getvalue()
+    assert "n_tiles=3" in stream.getvalue()
+
+
+def test_the_settings_that_are_logged_are_json() -> None:
+    from potserver.config import as_tree
+
+    json.dumps(as_tree(Settings()))
+
+
+def test_serve_help_says_who_may_write(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        cli.main(["serve", "--help"])
+    text = " ".join(capsys.readouterr().out.split())
+    assert "Anyone who reaches the port may write: use Zenoh's access control and TLS." in text
+    assert "security notes" not in text
+
+
+def _store(capsys: pytest.CaptureFixture[str], *flags: str) -> str | None:
+    assert cli.main(["config", "show", "--json", *flags]) == 0
+    directory: str | None = json.loads(capsys.readouterr().out)["store"]["directory"]
+    return directory
+
+
+def test_a_server_keeps_its_maps_in_the_users_state_folder_unless_told_otherwise(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    assert _store(capsys) == str(tmp_path / "potserver" / "potserver")
+    assert _store(capsys, "--server-id", "roof") == str(tmp_path / "potserver" / "roof")
+    assert _store(capsys, "--store", "maps") == "maps"
+    assert _store(capsys, "--in-memory") == ""
+    monkeypatch.setenv("POTSERVER_STORE__DIRECTORY", "/var/maps")
+    assert _store(capsys) == "/var/maps"
+    assert _store(capsys, "--in-memory") == ""
+    monkeypatch.delenv("POTSERVER_STORE__DIRECTORY")
+    for relative in ("", "state"):
+        monkeypatch.setenv("XDG_STATE_HOME", relative)
+        monkeypatch.setenv("HOME", str(tmp_path))
+        assert _store(capsys) == str(tmp_path / ".local" / "state" / "potserver" / "potserver")
