@@ -268,13 +268,12 @@ def _draw_atoms(dictionary: AtomDictionary, options: argparse.Namespace, *, titl
 def _atoms_export(options: argparse.Namespace) -> int:
     from potserver.adapters import codec
     from potserver.domain.dictionary import AtomDictionary
-    from potserver.domain.types import AnswerRule
+    from potserver.mapping.service import method_of
 
     settings = _settings(options)
     dictionary = AtomDictionary.load(settings.dictionary) if settings.dictionary else AtomDictionary.builtin()
     atoms = [dictionary.get(atom_id) for atom_id in options.atom_id] or list(dictionary)
-    m = settings.mapping
-    rule = AnswerRule(m.observed_activation, m.prior_var, m.residual_var, m.mean_moderation)
+    rule = method_of(settings.mapping.profile).rule
     folder = Path(options.out)
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -288,7 +287,7 @@ def _atoms_export(options: argparse.Namespace) -> int:
 
 def _atoms_import(options: argparse.Namespace) -> int:
     from potserver.adapters import codec
-    from potserver.atoms.admission import admit
+    from potserver.atoms.admission import AdmissionSettings, admit
     from potserver.domain.dictionary import AtomDictionary
 
     settings = _settings(options)
@@ -297,7 +296,7 @@ def _atoms_import(options: argparse.Namespace) -> int:
     for name in options.file:
         try:
             atom = codec.read_atom_file(Path(name).read_bytes())
-            admit(atom, dictionary, settings.atoms.admission)
+            admit(atom, dictionary, AdmissionSettings())
         except OSError as error:
             raise SettingsError(f"cannot read {name}: {error.strerror or error}") from error
         except PotserverError as error:

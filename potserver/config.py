@@ -16,17 +16,15 @@ import math
 import re
 import sys
 import typing
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from enum import Enum
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, NamedTuple
 
 import msgspec
 
 from potschemas import keys
-from potschemas.messages import MAX_PART_KERNELS
 from potserver.adapters.session import ZenohSettings
-from potserver.atoms.admission import AdmissionSettings
 from potserver.errors import SettingsError
 from potserver.limits import Limits
 from potserver.mapping.settings import MappingSettings
@@ -42,78 +40,72 @@ _NOT_SETTINGS = re.compile(r"(SETTINGS|SERVICE_(HOST|PORT)(_.*)?|PORT(_\d+_.*)?)
 class IntakeSettings:
     """Clouds on their way to the mapper."""
 
-    max_queued: int = 16  # clouds waiting, each map
-    max_queued_bytes: int = 64 * 2**20
-    retry_after_s: float = 0.5  # advice to senders that were refused for load
-    robots: tuple[str, ...] = ()  # allow list; empty allows every legal id
-    allow_old_stamps: bool = False  # take clouds that are not newer than the robot's last accepted one
-    max_future_s: float = 5.0  # clouds and poses stamped further ahead of our clock are refused
+    max_queued: Annotated[int, "clouds that may wait, each map; one more is refused at once"] = 16
+    robots: Annotated[tuple[str, ...], "robots that may send; none named: every legal id"] = ()
+    allow_old_stamps: Annotated[bool, "take clouds that are not newer than the robot's last accepted one"] = (
+        False
+    )
+    max_future_s: Annotated[
+        float, "clouds and poses stamped further ahead of the server's clock are refused"
+    ] = 5.0
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class QuerySettings:
     """Questions to the maps."""
 
-    threads: int = 2  # queries in work at once
-    max_queued: int = 64
-    max_queued_bytes: int = 32 * 2**20
-    retry_after_s: float = 0.2
-    grid_part_cells: int = 65_536
-    params_part_kernels: int = 20_000
-    tiles_part_kernels: int = 20_000
+    threads: Annotated[int, "questions in work at once"] = 2
+    max_queued: Annotated[int, "questions that may wait, all maps; one more is refused at once"] = 64
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class PoseSettings:
     """The optional pose streams of robots whose clouds bring no pose."""
 
-    max_per_robot: int = 1024
-    max_gap_s: float = 0.5  # between two poses that are interpolated
-    wait_s: float = 0.2  # for the stream to reach a cloud's stamp; the mapper waits that long
+    max_gap_s: Annotated[float, "longest time between two poses that are interpolated"] = 0.5
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class AtomSettings:
     """Changes of the atom dictionary over `q/atoms`."""
 
-    writable: bool = True  # whoever reaches the server may change it, as they may send clouds and clear maps
-    save: bool = False  # write each change to the file `dictionary` before it is acknowledged; else a restart forgets it
-    admission: AdmissionSettings = dataclasses.field(default_factory=AdmissionSettings)
+    writable: Annotated[bool, "whoever reaches the server may add and remove atoms"] = True
+    save: Annotated[bool, "write each change to the file `dictionary`; else a restart forgets it"] = False
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class StoreSettings:
     """Where the maps survive a restart."""
 
-    directory: str | None = (
-        None  # a folder for all maps; none or "": in memory only. `potserver serve` has a default
+    directory: Annotated[
+        str | None, 'folder for all maps; `""`: in memory only. `potserver serve` has a default'
+    ] = None
+    fsync: Annotated[bool, "wait for the disk with each cloud; else a power cut may take the last ones"] = (
+        True
     )
-    fsync: bool = True  # wait for the disk with each cloud; else a power cut, though no crash of ours, takes the last ones
-    snapshot_scans: int = 50  # clouds after which the changed tiles are written and the journal begins anew
-    snapshot_bytes: int = 64 * 2**20  # of the journal, likewise
-    max_saved: int = 100  # copies with a name (`potclient map save NAME`); one more is refused
+    snapshot_scans: Annotated[
+        int, "clouds after which changed tiles are written and the journal begins anew"
+    ] = 50
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class LogSettings:
     """What goes to stderr."""
 
-    level: str = "info"  # debug, info, warning or error
-    format: str = "auto"  # json, console, or auto: console on a terminal
+    level: Annotated[str, "`debug`, `info`, `warning` or `error`"] = "info"
+    format: Annotated[str, "`json`, `console`, or `auto`: console on a terminal"] = "auto"
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class Settings:
     """Everything a server may be told."""
 
-    server_id: str = "potserver"
-    root: str = keys.DEFAULT_ROOT
-    maps: tuple[str, ...] = ("default",)
-    dictionary: str | None = None  # an atom dictionary file; default: the built-in atoms
-    threads: int | None = None  # for integrating one scan; default: all processors
-    seed: int = 0
-    stats_period_s: float = 1.0
-    drain_timeout_s: float = 10.0  # at SIGTERM, for the clouds that wait
+    server_id: Annotated[str, "id of the server in its keys"] = "potserver"
+    root: Annotated[str, "first chunks of all keys"] = keys.DEFAULT_ROOT
+    maps: Annotated[tuple[str, ...], "ids of the maps that are served"] = ("default",)
+    dictionary: Annotated[str | None, "file of an atom dictionary; unset: the built-in atoms"] = None
+    threads: Annotated[int | None, "threads for integrating one scan; unset: all processors"] = None
+    drain_timeout_s: Annotated[float, "at SIGTERM, time for the clouds that wait"] = 10.0
     zenoh: ZenohSettings = dataclasses.field(default_factory=ZenohSettings)
     limits: Limits = dataclasses.field(default_factory=Limits)
     intake: IntakeSettings = dataclasses.field(default_factory=IntakeSettings)
@@ -127,6 +119,33 @@ class Settings:
 
     def __post_init__(self) -> None:
         _check(self)
+
+
+# Names of earlier versions, refused with the new name or the reason why there is none.
+_RENAMED = {
+    "mapping.fine_m": "mapping.resolution_m",
+    "mapping.gap_m": "mapping.free_gap_m",
+}
+_NOW_FIXED = {
+    "": ("seed", "stats_period_s"),
+    "zenoh": ("shared_memory_queries",),
+    "limits": ("max_query_rays", "max_query_poses", "max_query_spheres", "max_query_tiles"),
+    "intake": ("max_queued_bytes", "retry_after_s"),
+    "queries": (
+        "max_queued_bytes", "retry_after_s", "grid_part_cells", "params_part_kernels", "tiles_part_kernels",
+    ),
+    "poses": ("max_per_robot", "wait_s"),
+    "atoms": ("admission",),
+    "store": ("snapshot_bytes", "max_saved"),
+    "mapping": (
+        "free_per_beam", "match_beams", "n_sectors", "align_sectors", "keep_in_sector",
+        "rank_hits", "rank_free", "rank_voxel_m", "rank_reg_m2", "rank_tolerance", "rank_iterations", "rank_score",
+        "rotations_deg", "couple_points", "couple_voxel_m", "couple_reg", "couple_tolerance", "couple_iterations",
+        "label_aware", "out_of_sample", "refine", "prior_var", "borrowed_var_per_m2", "borrow_weights", "feature_cut",
+        "instant_newton_steps", "instant_gradient_steps", "newton_steps", "gradient_steps", "cheap_values",
+        "saturation", "memory", "carry_into_map", "observed_activation", "residual_var", "mean_moderation", "calibrate",
+    ),
+}  # fmt: skip
 
 
 def load_settings(
@@ -197,6 +216,72 @@ def to_toml(settings: Settings) -> str:
     return "\n".join(lines) + "\n"
 
 
+class Leaf(NamedTuple):
+    """One setting, for people."""
+
+    path: str  # dotted key
+    value: Any  # plain, as in `as_tree`
+    default: Any  # of the profile, for the table `mapping`
+    kind: str  # of its values
+    text: str  # what it does
+
+
+def describe(settings: Settings) -> list[Leaf]:
+    """Every setting, in the order of the tree."""
+    base = Settings(mapping=MappingSettings.of_profile(settings.mapping.profile))
+    return list(_leaves(Settings, as_tree(settings), as_tree(base), ""))
+
+
+def settings_page() -> str:
+    """`docs/settings.md`: all settings as tables."""
+    lines = [_PAGE_HEAD]
+    table = None
+    for leaf in describe(Settings()):
+        name, _, key = leaf.path.rpartition(".")
+        if name != table:
+            table = name
+            title = f"`[{name}]`" if name else "Top level"
+            lines.append(f"\n## {title}\n\n| key | default | what it does |\n| --- | --- | --- |")
+        default = "unset" if leaf.default is None else f"`{_toml_value(leaf.default)}`"
+        lines.append(f"| `{key}` ({leaf.kind}) | {default} | {leaf.text} |")
+    paper = as_tree(MappingSettings.of_profile("paper"))
+    ours = as_tree(MappingSettings())
+    other = ", ".join(f"`{key} = {_toml_value(value)}`" for key, value in paper.items() if value != ours[key])
+    lines.append(f"\nProfile `paper` starts from {other}.")
+    return "\n".join(lines) + "\n"
+
+
+_PAGE_HEAD = """# Settings
+
+Every setting of a server. Defaults < TOML file (`--settings FILE`) < variables (`POTSERVER_LIMITS__MAX_CLOUD_BYTES=1000000`) <
+flags (`--set limits.max_cloud_bytes=1000000`). `potserver config show` prints those in force. An unknown name is an error.
+This page is generated: `make fix` writes it."""
+
+
+def _leaves(kind: Any, tree: Mapping[str, Any], base: Mapping[str, Any], prefix: str) -> Iterator[Leaf]:
+    hints = typing.get_type_hints(kind, include_extras=True)
+    tables = []
+    for field in dataclasses.fields(kind):
+        name, hint = field.name, hints[field.name]
+        if dataclasses.is_dataclass(hint):
+            tables.append((name, hint))
+            continue
+        plain, text = typing.get_args(hint)
+        yield Leaf(f"{prefix}{name}", tree[name], base[name], _kind_text(plain), text)
+    for name, hint in tables:
+        yield from _leaves(hint, tree[name], base[name], f"{prefix}{name}.")
+
+
+def _kind_text(kind: Any) -> str:
+    if typing.get_origin(kind) is tuple:
+        return "list of text"
+    if typing.get_origin(kind) is Mapping:
+        return "table"
+    accepted = [k for k in typing.get_args(kind) or (kind,) if k is not type(None)]
+    names = {str: "text", int: "integer", float: "number", bool: "true or false"}
+    return " or ".join(names[k] for k in accepted)
+
+
 # --- reading ------------------------------------------------------------------------------------------------
 
 
@@ -243,6 +328,10 @@ def _kind_of(path: list[str], source: str) -> Any:
         known = _types(kind) if dataclasses.is_dataclass(kind) else {}
         if key not in known:
             name = ".".join(path[: depth + 1])
+            if name in _RENAMED:
+                raise SettingsError(f"{source}: {name} is called {_RENAMED[name]} now")
+            if key in _NOW_FIXED.get(".".join(path[:depth]), ()):
+                raise SettingsError(f"{source}: {name} is no setting any more, it is fixed: leave it out")
             near = difflib.get_close_matches(key, known, n=1)
             hint = f"; did you mean {'.'.join([*path[:depth], near[0]])}?" if near else ""
             raise SettingsError(f"{source}: no setting {name!r}{hint}")
@@ -284,7 +373,7 @@ def _build(kind: Any, tree: Mapping[str, Any], prefix: str) -> Any:
             values[key] = _build(types[key], value, f"{path}.")
         else:
             values[key] = _convert(value, types[key], path)
-    if kind is MappingSettings:
+    if kind is MappingSettings:  # a bad profile is named by its own check
         base = MappingSettings.of_profile(values.get("profile", "default"))
         return dataclasses.replace(base, **values)
     return kind(**values)
@@ -325,14 +414,9 @@ def _check(s: Settings) -> None:
             value = getattr(getattr(s, table), field.name)
             if isinstance(value, bool | tuple):
                 continue
-            least = 0 if field.name in ("wait_s", "retry_after_s") else 1e-9
-            need(f"{table}.{field.name}", math.isfinite(value) and value >= least, "a positive number")
+            need(f"{table}.{field.name}", math.isfinite(value) and value > 0, "a positive number")
     need("store.snapshot_scans", s.store.snapshot_scans > 0, "at least 1")
-    need("store.snapshot_bytes", s.store.snapshot_bytes > 0, "at least 1")
-    need("store.max_saved", s.store.max_saved >= 0, "at least 0")
-    need("seed", s.seed >= 0, "at least 0")
     need("threads", s.threads is None or s.threads > 0, "at least 1")
-    need("stats_period_s", 0.01 <= s.stats_period_s < math.inf, "at least 0.01 s")
     need("drain_timeout_s", 0 <= s.drain_timeout_s < math.inf, "a number of seconds")
     need("zenoh.mode", s.zenoh.mode in (None, "peer", "client", "router"), "peer, client or router")
     need(
@@ -342,21 +426,6 @@ def _check(s: Settings) -> None:
     )
     need("log.level", s.log.level in ("debug", "info", "warning", "error"), "debug, info, warning or error")
     need("log.format", s.log.format in ("auto", "json", "console"), "auto, json or console")
-    need(
-        "intake.max_queued_bytes",
-        s.intake.max_queued_bytes >= s.limits.max_cloud_bytes,
-        "at least limits.max_cloud_bytes",
-    )
-    need(
-        "queries.max_queued_bytes",
-        s.queries.max_queued_bytes >= s.limits.max_query_bytes,
-        "at least limits.max_query_bytes",
-    )
-    need(
-        "queries.tiles_part_kernels",
-        s.queries.tiles_part_kernels <= MAX_PART_KERNELS,
-        f"at most {MAX_PART_KERNELS}, which is all that askers take",
-    )
 
 
 def _toml_key(key: str) -> str:
@@ -369,3 +438,7 @@ def _toml_value(value: Any) -> str:
     if isinstance(value, list):
         return "[" + ", ".join(_toml_value(v) for v in value) + "]"
     return json.dumps(value) if isinstance(value, str) else repr(value)
+
+
+if __name__ == "__main__":
+    sys.stdout.write(settings_page())

@@ -3,24 +3,29 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Annotated, ClassVar
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class Limits:
-    """Every bound on what comes in; each is a setting in the `[limits]` table."""
+    """Every bound on what comes in: the table `limits` of the settings, and bounds that follow from them."""
 
-    max_cloud_bytes: int = 8 * 2**20
-    max_cloud_points: int = 400_000
-    max_query_bytes: int = 4 * 2**20
-    max_query_points: int = 200_000
-    max_grid_cells: int = 4_000_000
-    max_query_rays: int = 50_000
-    max_query_poses: int = 5_000
-    max_query_spheres: int = 256
-    max_query_samples: int = 4_000_000  # steps of all rays of a query; cells at all poses of one
-    max_query_tiles: int = 100_000  # that the asker of one `q/tiles` has
-    max_coordinate_m: float = 2.0e7  # each coordinate in the map frame; UTM northings end at 1e7
-    max_robots: int = 1024  # robots remembered at once: stamps, poses, presence
+    max_cloud_bytes: Annotated[int, "of one cloud's message"] = 8 * 2**20
+    max_cloud_points: Annotated[int, "of one cloud"] = 400_000
+    max_query_bytes: Annotated[int, "of one question's message"] = 4 * 2**20
+    max_query_points: Annotated[int, "of one `q/points`"] = 200_000
+    max_grid_cells: Annotated[int, "of one `q/grid`"] = 4_000_000
+    max_query_samples: Annotated[
+        int, "steps of all rays of one `q/rays`, cells at all poses of one `q/risk`"
+    ] = 4_000_000
+    max_coordinate_m: Annotated[float, "of anything in the map frame; UTM northings end at 1e7"] = 2.0e7
+    max_robots: Annotated[int, "robots remembered at once: stamps, poses, presence"] = 1024
+
+    # `max_query_bytes` and `max_query_samples` bound the work; these only keep single numbers sane
+    max_query_rays: ClassVar[int] = 50_000
+    max_query_poses: ClassVar[int] = 5_000
+    max_query_spheres: ClassVar[int] = 256
+    max_query_tiles: ClassVar[int] = 100_000  # that the asker of one `q/tiles` has
 
     @property
     def wire_guard_bytes(self) -> int:

@@ -40,6 +40,7 @@ from potserver.adapters.session import build_config, close_session, open_session
 from potserver.adapters.threads import spawn
 from potserver.adapters.writer import MapWriter
 from potserver.asking.service import QueryService
+from potserver.atoms.admission import AdmissionSettings
 from potserver.atoms.store import AtomStore
 from potserver.config import Settings, as_tree
 from potserver.domain.dictionary import AtomDictionary
@@ -133,8 +134,8 @@ class MapServer:
                 self._pool = QueryPool(
                     threads=s.queries.threads,
                     max_queued=s.queries.max_queued,
-                    max_queued_bytes=s.queries.max_queued_bytes,
-                    retry_after_s=s.queries.retry_after_s,
+                    max_queued_bytes=8 * s.limits.max_query_bytes,
+                    retry_after_s=0.2,
                 )
                 atoms = _atom_store([mapper for mapper, _ in services.values()], s)
                 for map_id, (mapper, asker) in services.items():
@@ -249,12 +250,10 @@ class MapServer:
         store = MapStore(
             Path(s.directory).expanduser(),
             map_id,
-            keeps_evidence=mapper.settings.refine,
+            keeps_evidence=mapper.keeps_evidence,
             health=self.health,
             fsync=s.fsync,
             snapshot_scans=s.snapshot_scans,
-            snapshot_bytes=s.snapshot_bytes,
-            max_saved=s.max_saved,
         )
         self._stores[map_id] = store
         return store.restore(mapper).stamps
@@ -314,13 +313,13 @@ class _MapNode:
         allowed = frozenset(s.intake.robots)
         self.intake = IntakeQueue(
             max_queued=s.intake.max_queued,
-            max_queued_bytes=s.intake.max_queued_bytes,
-            retry_after_s=s.intake.retry_after_s,
+            max_queued_bytes=8 * s.limits.max_cloud_bytes,
+            retry_after_s=0.5,
         )
         self.prompt = Outbox(
-            f"{map_id}-prompt", max_pending=4096, max_pending_bytes=s.intake.max_queued_bytes
+            f"{map_id}-prompt", max_pending=4096, max_pending_bytes=8 * s.limits.max_cloud_bytes
         )
-        self.bulk = Outbox(f"{map_id}-bulk", max_pending=64, max_pending_bytes=s.intake.max_queued_bytes)
+        self.bulk = Outbox(f"{map_id}-bulk", max_pending=64, max_pending_bytes=8 * s.limits.max_cloud_bytes)
         self._receipts = ReceiptSender(
             session,
             self._keys,
@@ -332,7 +331,6 @@ class _MapNode:
             bulk=self.bulk,
         )
         poses = PoseBuffer(
-            max_per_robot=s.poses.max_per_robot,
             max_robots=s.limits.max_robots,
             max_gap_s=s.poses.max_gap_s,
             max_future_s=s.intake.max_future_s,
@@ -350,7 +348,7 @@ class _MapNode:
             allowed_robots=allowed,
             allow_old_stamps=s.intake.allow_old_stamps,
             max_future_s=s.intake.max_future_s,
-            pose_wait_s=s.poses.wait_s,
+            pose_wait_s=0.2,
         )
         self._writer_thread = spawn(f"{map_id}-writer", self._writer.run)
 
@@ -395,9 +393,9 @@ class _MapNode:
                 pool=pool,
                 health=health,
                 limits=s.limits,
-                grid_part_cells=s.queries.grid_part_cells,
-                params_part_kernels=s.queries.params_part_kernels,
-                tiles_part_kernels=s.queries.tiles_part_kernels,
+                grid_part_cells=65_536,
+                params_part_kernels=20_000,
+                tiles_part_kernels=20_000,
                 encode_info=encode_info,
             ),
             ControlQueryable(
@@ -458,7 +456,7 @@ class _StatsPublisher:
         self, session: zenoh.Session, encode: Callable[[], codec.Wire], *, settings: Settings
     ) -> None:
         key = keys.stats_key(settings.root, settings.server_id)
-        self._encode, self._period_s = encode, settings.stats_period_s
+        self._encode, self._period_s = encode, 1.0
         self._stop = threading.Event()
         # background: the first to go when a link is full
         self._publisher = session.declare_publisher(
@@ -496,7 +494,7 @@ def _atom_store(mappers: list[Mapper], settings: Settings) -> AtomStore:
     return AtomStore(
         mappers[0].dictionary,
         use,
-        settings=settings.atoms.admission,
+        settings=AdmissionSettings(),
         writable=settings.atoms.writable,
         file=Path(str(settings.dictionary)) if is_saved else None,
         threads=settings.threads or default_threads(),
@@ -513,9 +511,7 @@ def _default_maps(settings: Settings) -> MakeMap:
                 if settings.dictionary is None
                 else AtomDictionary.load(settings.dictionary)
             )
-        mapping = MappingService(
-            dictionary[0], settings.mapping, map_id=map_id, threads=settings.threads, seed=settings.seed
-        )
+        mapping = MappingService(dictionary[0], settings.mapping, map_id=map_id, threads=settings.threads)
         asker = QueryService(
             mapping,
             max_points=settings.limits.max_query_points,

@@ -8,10 +8,10 @@ from typing import Any
 
 import pytest
 
-from potserver.config import Settings, as_tree, load_settings, to_toml
+from potserver.config import Settings, as_tree, describe, load_settings, settings_page, to_toml
 from potserver.errors import SettingsError
 from potserver.limits import Limits
-from potserver.mapping.settings import PAPER, MappingSettings
+from potserver.mapping.settings import MappingSettings
 
 
 @pytest.fixture
@@ -34,18 +34,22 @@ def test_the_defaults_are_legal_and_local() -> None:
 
 def test_flags_win_over_variables_over_the_file_over_defaults(write: Any) -> None:
     file = write(
-        'server_id = "file"\nroot = "file"\nseed = 1\n[limits]\nmax_cloud_points = 10\nmax_query_points = 11\n'
+        'server_id = "file"\nroot = "file"\nthreads = 1\n[limits]\nmax_cloud_points = 10\nmax_query_points = 11\n'
     )
-    environ = {"POTSERVER_ROOT": "environ", "POTSERVER_SEED": "2", "POTSERVER_LIMITS__MAX_CLOUD_POINTS": "20"}
-    settings = load_settings(file=file, environ=environ, overrides={"seed": 3})
-    assert (settings.server_id, settings.root, settings.seed) == ("file", "environ", 3)
+    environ = {
+        "POTSERVER_ROOT": "environ",
+        "POTSERVER_THREADS": "2",
+        "POTSERVER_LIMITS__MAX_CLOUD_POINTS": "20",
+    }
+    settings = load_settings(file=file, environ=environ, overrides={"threads": 3})
+    assert (settings.server_id, settings.root, settings.threads) == ("file", "environ", 3)
     assert (settings.limits.max_cloud_points, settings.limits.max_query_points) == (20, 11)
     assert settings.limits.max_grid_cells == Limits().max_grid_cells
 
 
 def test_a_variable_may_name_the_file(write: Any) -> None:
-    file = write("seed = 5")
-    assert load_settings(environ={"POTSERVER_SETTINGS": str(file)}).seed == 5
+    file = write("threads = 5")
+    assert load_settings(environ={"POTSERVER_SETTINGS": str(file)}).threads == 5
 
 
 @pytest.mark.parametrize(
@@ -53,9 +57,9 @@ def test_a_variable_may_name_the_file(write: Any) -> None:
     [
         ("MAPS", "ground,first_floor", "maps", ("ground", "first_floor")),
         ("MAPS", '["a", "b"]', "maps", ("a", "b")),
-        ("MAPPING__ROTATIONS_DEG", "-10, 0, 10", "mapping.rotations_deg", (-10.0, 0.0, 10.0)),
-        ("MAPPING__REFINE", "false", "mapping.refine", False),
-        ("MAPPING__RANK_SCORE", "normalised", "mapping.rank_score", "normalised"),
+        ("INTAKE__ROBOTS", "r1, r2", "intake.robots", ("r1", "r2")),
+        ("STORE__FSYNC", "false", "store.fsync", False),
+        ("MAPPING__PROFILE", "paper", "mapping.profile", "paper"),
         ("DICTIONARY", "/data/1.npz", "dictionary", "/data/1.npz"),
         ("SERVER_ID", "42", "server_id", "42"),
         ("THREADS", "3", "threads", 3),
@@ -66,7 +70,7 @@ def test_a_variable_may_name_the_file(write: Any) -> None:
             {"transport/link/tx/lease": 5000},
         ),
         ("ZENOH__LISTEN", "tcp/127.0.0.1:0", "zenoh.listen", ("tcp/127.0.0.1:0",)),
-        ("POSES__WAIT_S", "0", "poses.wait_s", 0.0),
+        ("MAPPING__HALF_LIFE_S", "0", "mapping.half_life_s", 0.0),
     ],
 )
 def test_variables_are_read_as_their_keys_want(name: str, text: str, path: str, value: Any) -> None:
@@ -88,9 +92,10 @@ def test_what_kubernetes_injects_for_a_service_of_our_name_is_not_ours() -> None
 
 
 def test_a_profile_sets_what_the_other_keys_start_from(write: Any) -> None:
-    assert load_settings(overrides={"mapping.profile": "paper"}).mapping == PAPER
-    settings = load_settings(file=write('[mapping]\nprofile = "paper"\nn_sectors = 7\n'))
-    assert settings.mapping == dataclasses.replace(PAPER, n_sectors=7)
+    paper = MappingSettings.of_profile("paper")
+    assert load_settings(overrides={"mapping.profile": "paper"}).mapping == paper
+    settings = load_settings(file=write('[mapping]\nprofile = "paper"\nmax_range_m = 7.0\n'))
+    assert settings.mapping == dataclasses.replace(paper, max_range_m=7.0)
     assert load_settings().mapping == MappingSettings()
 
 
@@ -107,8 +112,14 @@ def test_a_profile_sets_what_the_other_keys_start_from(write: Any) -> None:
         ({"limits.max_cloud_bytes": "many"}, r"limits\.max_cloud_bytes = 'many': expected `int`"),
         ({"limits.max_cloud_bytes": 0}, "need a positive number"),
         ({"limits.max_coordinate_m": float("nan")}, "need a positive number"),
-        ({"intake.max_queued_bytes": 10}, r"need at least limits\.max_cloud_bytes"),
-        ({"queries.max_queued_bytes": 10}, r"need at least limits\.max_query_bytes"),
+        (
+            {"mapping.fine_m": 0.2},
+            r"flag mapping\.fine_m: mapping\.fine_m is called mapping\.resolution_m now",
+        ),
+        ({"mapping.gap_m": 0.2}, r"is called mapping\.free_gap_m now"),
+        ({"mapping.n_sectors": 5}, r"mapping\.n_sectors is no setting any more"),
+        ({"seed": 1}, "seed is no setting any more"),
+        ({"atoms.admission.max_atoms": 1}, r"atoms\.admission is no setting any more"),
         ({"maps": []}, "at least one map"),
         ({"maps": ["a", "a"]}, "each once"),
         ({"maps": ["srv"]}, "another name"),
@@ -121,11 +132,11 @@ def test_a_profile_sets_what_the_other_keys_start_from(write: Any) -> None:
         ({"threads": 0}, "at least 1"),
         ({"zenoh.mode": "broker"}, "peer, client or router"),
         ({"log.level": "loud"}, "debug, info"),
-        ({"mapping.profile": "none"}, "no profile 'none'"),
-        ({"mapping.max_range_m": -1.0}, r"mapping\.max_range_m is -1\.0, need positive"),
-        ({"mapping.rank_score": "best"}, r"mapping\.rank_score = 'best'"),
-        ({"stats_period_s": 0.0}, "at least"),
-        ({"seed": -1}, "at least 0"),
+        ({"mapping.profile": "none"}, "'none', need one of default, paper"),
+        ({"mapping.max_range_m": -1.0}, r"mapping\.max_range_m is -1\.0, need a positive number"),
+        ({"mapping.beams_per_scan": 1.5}, r"mapping\.beams_per_scan = 1\.5"),
+        ({"store.snapshot_scans": 0}, "at least 1"),
+        ({"drain_timeout_s": -1.0}, "number of seconds"),
     ],
 )
 def test_illegal_settings_say_which_and_why(overrides: dict[str, Any], message: str) -> None:
@@ -139,8 +150,8 @@ def test_illegal_settings_say_which_and_why(overrides: dict[str, Any], message: 
         ("limits = 3", "limits is a table"),
         ("[limit]\n", r"no setting 'limit'; did you mean limits\?"),
         ("[limits]\nx = 1\n", r"no setting 'limits\.x'"),
-        ("seed = ", "is not TOML"),
-        ('seed = "x"', "seed = 'x'"),
+        ("threads = ", "is not TOML"),
+        ('threads = "x"', "threads = 'x'"),
     ],
 )
 def test_errors_of_a_file_name_the_file_or_key(write: Any, text: str, message: str) -> None:
@@ -166,7 +177,6 @@ def test_what_is_shown_can_be_read_back(write: Any) -> None:
             "dictionary": 'a "quoted" path.npz',
             "zenoh.cfg": {"transport/link/tx/lease": 5000, "mode": "peer"},
             "mapping.profile": "paper",
-            "mapping.rotations_deg": [0.0],
         }
     )
     assert load_settings(file=write(to_toml(settings))) == settings
@@ -185,3 +195,25 @@ def test_the_tree_is_plain() -> None:
             assert value is None or type(value) in (bool, int, float, str)
 
     check(as_tree(Settings()))
+
+
+def test_an_operator_meets_few_settings_each_with_a_description() -> None:
+    leaves = describe(Settings())
+    assert len(leaves) <= 45
+    assert sum(leaf.path.startswith("mapping.") for leaf in leaves) <= 14
+    assert len({leaf.path for leaf in leaves}) == len(leaves)
+    for leaf in leaves:
+        assert len(leaf.text) >= 8, leaf.path
+        assert leaf.value == leaf.default
+
+
+def test_what_differs_from_the_default_of_the_profile_is_told() -> None:
+    settings = load_settings(overrides={"mapping.profile": "paper", "threads": 3, "mapping.max_range_m": 9.0})
+    changed = {
+        leaf.path: (leaf.value, leaf.default) for leaf in describe(settings) if leaf.value != leaf.default
+    }
+    assert changed == {"threads": (3, None), "mapping.max_range_m": (9.0, 20.0)}
+
+
+def test_the_page_of_settings_is_the_generated_one(root: Path) -> None:
+    assert (root / "docs" / "settings.md").read_text() == settings_page(), "run `make fix`"

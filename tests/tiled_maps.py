@@ -15,7 +15,7 @@ from potserver.domain.map_state import MapState
 from potserver.domain.tiles import COARSE, MapKernels, Tile, TiledMap, TileGrid, TileIndex
 from potserver.domain.types import KernelSet
 from potserver.limits import Limits
-from potserver.mapping.refinement import kernels_at
+from potserver.mapping.placing import kernels_at
 from potserver.numerics.evidence import Rows
 
 GRID = TileGrid.of(8.0, 0.4)

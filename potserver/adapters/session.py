@@ -14,7 +14,7 @@ import socket
 import threading
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import zenoh
 
@@ -32,17 +32,16 @@ _FREE_PORT_TRIES = 5
 class ZenohSettings:
     """How our node joins a Zenoh network: the usual flags, by their usual names."""
 
-    mode: str | None = None  # peer (default), client or router
-    connect: tuple[str, ...] = ()  # endpoints of routers or peers to join
-    listen: tuple[str, ...] = ()  # default tcp/127.0.0.1:7447; port 0 picks a free one
-    config: str | None = None  # a Zenoh configuration file; default $ZENOH_CONFIG
-    cfg: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # single keys, as --cfg KEY:VALUE
-    shared_memory: bool = (
-        True  # puts between processes of one host may go through /dev/shm; off in small containers
+    mode: Annotated[str | None, "`peer`, `client` or `router`; unset: peer"] = None
+    connect: Annotated[tuple[str, ...], "endpoints of routers or peers to join"] = ()
+    listen: Annotated[tuple[str, ...], "endpoints; none: tcp/127.0.0.1:7447. Port 0 picks a free one"] = ()
+    config: Annotated[str | None, "a Zenoh configuration file; unset: `$ZENOH_CONFIG`"] = None
+    cfg: Annotated[Mapping[str, Any], "single keys of it, as `--cfg KEY:VALUE`"] = dataclasses.field(
+        default_factory=dict
     )
-    shared_memory_queries: bool = (
-        False  # queries and replies too: faster, but can lose them when a receiver stalls
-    )
+    shared_memory: Annotated[
+        bool, "puts between processes of one host may go through /dev/shm; off in small containers"
+    ] = True
 
 
 def build_config(settings: ZenohSettings, *, root: str, wire_guard_bytes: int) -> zenoh.Config:
@@ -85,8 +84,6 @@ def build_config(settings: ZenohSettings, *, root: str, wire_guard_bytes: int) -
         _insert(config, "listen/endpoints", [])
     if not settings.shared_memory:
         _insert(config, "transport/shared_memory/enabled", False)
-    elif settings.shared_memory_queries:
-        _insert(config, "transport/shared_memory/transport_optimization/messages", ["put", "query", "reply"])
     if json.loads(config.get_json("transport/unicast/lowlatency")):
         # such a transport does not fragment: every message above 64 KiB would be lost
         raise SettingsError("transport/unicast/lowlatency loses every message above 64 KiB: leave it off")

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from potserver.atoms.distance import atom_distances
 from potserver.domain.types import Atom, Float64
 from potserver.errors import EmptyError, ShapeError
-from potserver.mapping.settings import MappingSettings
+from potserver.mapping.matching import Ranking
 from potserver.numerics.geometry import rotation_z
 
 _DISTANCE_DECIMALS = 3  # compared in these: last bits must not decide
@@ -141,7 +141,7 @@ class _Compared:
 def _turns(atom: Atom) -> list[Atom]:
     """The atom in every rotation that mapping tries by default."""
     turned = []
-    for angle in np.deg2rad(MappingSettings().rotations_deg):
+    for angle in np.deg2rad(Ranking().rotations_deg):
         rotation = rotation_z(float(angle)).T.astype(np.float32)
         turned.append(
             dataclasses.replace(

@@ -19,7 +19,7 @@ from potserver.domain.dictionary import AtomDictionary
 from potserver.domain.kernel_map import KernelMap
 from potserver.domain.types import Atom, Float64, KernelSet
 from potserver.errors import SettingsError
-from potserver.mapping.settings import MappingSettings
+from potserver.mapping.pipeline import DEFAULT_RULE
 
 _HIT, _FREE, _UNKNOWN, _FAINT = "#b2182b", "#2166ac", "#d9d9d9", 0.15
 _AXES = "xyz"
@@ -289,15 +289,7 @@ def _draw_prediction(mean: Any, std: Any, atom: Atom, view: _View, palette: _Pal
     )
     points = np.full((right.size, 3), view.level_m)
     points[:, view.right], points[:, view.up] = right.ravel(), up.ravel()
-    s = MappingSettings()
-    answer = KernelMap(
-        atom.kernels,
-        observed_activation=s.observed_activation,
-        prior_var=s.prior_var,
-        residual_var=s.residual_var,
-        mean_moderation=s.mean_moderation,
-        threads=1,
-    ).occupancy(points)
+    answer = KernelMap(atom.kernels, **DEFAULT_RULE._asdict(), threads=1).occupancy(points)
     extent = (
         view.lower[0], view.lower[0] + n_right * cell, view.lower[1], view.lower[1] + n_up * cell
     )  # fmt: skip

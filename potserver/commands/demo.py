@@ -77,9 +77,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except DatasetError as error:
         raise DemoError(str(error)) from error
     maps = tuple(recordings)
-    settings = Settings(
-        server_id="demo", maps=maps, stats_period_s=1.0, mapping=MappingSettings.of_profile(options.profile)
-    )
+    settings = Settings(server_id="demo", maps=maps, mapping=MappingSettings.of_profile(options.profile))
     console.print(
         f"[bold]potserver {__version__} demo[/bold]: a map server on loopback, and a robot that sends it "
         f"{sum(map(len, recordings.values()))} scans over Zenoh.\n"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import json
 import os
 import platform
@@ -25,6 +24,7 @@ from potserver.atoms.build.recipe import Reader, RecordingRecipe, open_recording
 from potserver.config import Settings
 from potserver.domain.dictionary import AtomDictionary
 from potserver.errors import SettingsError
+from potserver.evaluation.ablations import ABLATIONS
 from potserver.evaluation.mappers import Mapper, ServiceMap
 from potserver.evaluation.peers import peer_named
 from potserver.evaluation.protocol import Evaluation, Row, evaluate
@@ -80,17 +80,24 @@ def run(options: argparse.Namespace, settings: Settings) -> list[Evaluation]:
     return found
 
 
-def variants(settings: MappingSettings, *, ablations: bool) -> dict[str, MappingSettings]:
-    """Our maps, by the names of their rows: the one that is asked for, and what it is made of."""
-    found = {settings.profile: settings}
-    if ablations:
-        change = dataclasses.replace
-        found |= {
-            "POT, not refined": change(settings, refine=False),
-            "RePOT, transported prior": change(settings, carry_into_map=True),
-            "RePOT, flat prior": change(settings, carry_into_map=True, borrow_weights=False),
-        }
-    return found
+def our_maps(options: argparse.Namespace, settings: Settings, dictionary: AtomDictionary) -> list[Mapper]:
+    """The map that is asked for and, on request, what it is made of.
+
+    Raises:
+        SettingsError: ablations of another profile than `default`.
+    """
+    mapping, threads = settings.mapping, settings.threads or default_threads()
+    maps: list[Mapper] = [ServiceMap(mapping.profile, mapping, dictionary, threads=threads)]
+    if options.ablations:
+        if mapping.profile != "default":
+            raise SettingsError(
+                f"--ablations take parts out of profile `default`, not of `{mapping.profile}`"
+            )
+        maps += [
+            ServiceMap(name, mapping, dictionary, threads=threads, make_pipeline=make_pipeline)
+            for name, make_pipeline in ABLATIONS.items()
+        ]
+    return maps
 
 
 def to_markdown(evaluations: Sequence[Evaluation]) -> str:
@@ -120,10 +127,7 @@ def _evaluate(
     )
     recording = open_recording(dataset, reader)
     numbers = asked_scans(dataset, options.scans).numbers(len(recording))
-    maps: list[Mapper] = [
-        ServiceMap(name, mapping, dictionary, threads=threads)
-        for name, mapping in variants(settings.mapping, ablations=options.ablations).items()
-    ]
+    maps = our_maps(options, settings, dictionary)
     maps += [peer_named(name, threads=threads) for name in options.peers]
     with _progress(dataset, len(numbers) + len(maps)) as on_step:
         return evaluate(

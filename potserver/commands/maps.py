@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import functools
 import json
 import re
 import time
@@ -25,10 +26,11 @@ from potserver.config import Settings
 from potserver.domain.dictionary import AtomDictionary
 from potserver.domain.kernel_map import KernelMap
 from potserver.domain.map_state import MapState
-from potserver.domain.types import KernelSet
+from potserver.domain.types import AnswerRule, KernelSet
 from potserver.errors import MapFileError, SettingsError
 from potserver.limits import Limits
 from potserver.mapping.imports import state_of_kernels, state_of_places
+from potserver.mapping.paper import PAPER, PotPipeline
 from potserver.mapping.service import MappingService
 from potserver.mapping.settings import MappingSettings
 from potserver.storage.journal import scans_after
@@ -253,7 +255,7 @@ def _with_rule(saved: SavedMap) -> MapState:
 
 def _from_octomap(path: Path, looks: float, settings: Settings, say: Say) -> MapState:
     leaves, resolution = _read(lambda: read_bt(path), path)
-    fine_m = settings.mapping.fine_m or max(resolution, _FINEST_M)
+    fine_m = settings.mapping.resolution_m or max(resolution, _FINEST_M)
     places = places_of(leaves, resolution, fine_m, looks)
     say(
         f"{len(leaves.depth)} voxels of {resolution:g} m, {int(leaves.occupied.sum())} occupied:"
@@ -285,7 +287,8 @@ def places_of(leaves: Leaves, resolution: float, fine_m: float, looks: float = 1
     total = int((per_edge**3).sum())
     if total > _MAX_PLACES:
         raise SettingsError(
-            f"its voxels make {total} samples, the limit is {_MAX_PLACES}: take a coarser map, --set mapping.fine_m=METRES"
+            f"its voxels make {total} samples, the limit is {_MAX_PLACES}: take a coarser map,"
+            " --set mapping.resolution_m=METRES"
         )
     points, occupied, weight = [], [], []
     for n in np.unique(per_edge):
@@ -310,14 +313,13 @@ def places_of(leaves: Leaves, resolution: float, fine_m: float, looks: float = 1
 
 def _from_kernels(path: Path, settings: Settings) -> MapState:
     kernels = _read(lambda: ClientKernels.load(path), path)
-    rule = {
-        "observed_activation": kernels.observed_activation,
-        "prior_var": kernels.prior_var,
-        "residual_var": kernels.residual_var,
-        "mean_moderation": kernels.mean_moderation,
-    }
-    mapping = dataclasses.replace(settings.mapping, refine=False, calibrate=False, **rule)
-    service = MappingService(AtomDictionary(()), mapping, threads=settings.threads)
+    rule = AnswerRule(
+        kernels.observed_activation, kernels.prior_var, kernels.residual_var, kernels.mean_moderation
+    )
+    make_pipeline = functools.partial(PotPipeline, method=PAPER._replace(rule=rule))
+    service = MappingService(
+        AtomDictionary(()), settings.mapping, threads=settings.threads, make_pipeline=make_pipeline
+    )
     arrays = {f.name: getattr(kernels, f.name) for f in dataclasses.fields(KernelSet)}
     return state_of_kernels(service, KernelSet(**arrays))
 

@@ -2,28 +2,35 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Iterable
 
 import numpy as np
 
+from potserver.domain.kernel_map import OBSERVED_ACTIVATION
 from potserver.domain.tiles import CARRIED, MapKernels, Region, TiledMap, TileIndex, part_of, tiles_of_part
 from potserver.domain.types import Float64, check_rigid
 from potserver.errors import UnknownRobotError, UnsupportedError
-from potserver.mapping.fusion import Moment, add_evidence, add_kernels, refit
-from potserver.mapping.settings import MappingSettings
+from potserver.mapping.fusion import (
+    FitEffort,
+    FusionOptions,
+    Moment,
+    Samples,
+    add_evidence,
+    add_kernels,
+    refit,
+)
 from potserver.numerics import evidence
 from potserver.numerics.geometry import rotated_diagonal
 
 _SWEEPS = 3  # over the parts, each solved with those around it held
-_NEWTON_STEPS = 6  # of each solve at least: nobody waits for it as for a scan
+_EFFORT = FitEffort(newton_steps=6, most_newton_steps=18)  # nobody waits for an edit as for a scan
 
 
 def merge(
     ours: TiledMap,
     theirs: TiledMap,
     T_ours_theirs: Float64,
-    settings: MappingSettings,
+    options: FusionOptions,
     moment: Moment,
     *,
     threads: int,
@@ -37,7 +44,7 @@ def merge(
     Args:
         ours, theirs: Neither is changed.
         T_ours_theirs: (4, 4) rigid: p_ours = T_ours_theirs @ p_theirs.
-        settings: Of the pipeline.
+        options: As for scans.
         moment: Of the change.
         threads: Threads of the solves.
     Raises:
@@ -87,25 +94,26 @@ def merge(
             [
                 add_evidence(
                     region,
-                    points[data.source == source] - region.origin_m,
-                    data.occupied[data.source == source],
-                    data.sums[data.source == source, 3],
+                    Samples(
+                        points[data.source == source] - region.origin_m,
+                        data.occupied[data.source == source],
+                        data.sums[data.source == source, 3],
+                    ),
                     number,
-                    settings,
                 )
                 for source, number in enumerate(numbers)
             ]
         )
         planar = len(where) > 0 and float(np.ptp(where[:, 2])) < 1e-4 * theirs.grid.fine_m
-        add_kernels(region, new, carried, planar, settings, threads)
+        add_kernels(region, new, carried, options, planar, threads)
         tiles = region.tiles(lower, upper, revision=moment.revision, stamp_ns=moment.stamp_ns)
         ours = ours._replace(tiles={**ours.tiles, **tiles})  # indexed once, when all is settled
         touched.update(tiles)
-    return _settle(ours, touched, settings, moment, threads)
+    return _settle(ours, touched, moment, threads)
 
 
 def remove_robot(
-    tiled: TiledMap, robot_id: str, settings: MappingSettings, moment: Moment, *, threads: int
+    tiled: TiledMap, robot_id: str, moment: Moment, *, threads: int
 ) -> tuple[TiledMap, set[TileIndex]]:
     """The map without what one robot has seen, and the tiles that changed; places that nobody else saw are unknown again.
 
@@ -136,21 +144,20 @@ def remove_robot(
         for dz in (-1, 0, 1)
     }
     left = tiled._replace(tiles={**tiled.tiles, **without})
-    return _settle(left, around & left.tiles.keys(), settings, moment, threads)
+    return _settle(left, around & left.tiles.keys(), moment, threads)
 
 
 def _settle(
-    tiled: TiledMap, changed: Iterable[TileIndex], settings: MappingSettings, moment: Moment, threads: int
+    tiled: TiledMap, changed: Iterable[TileIndex], moment: Moment, threads: int
 ) -> tuple[TiledMap, set[TileIndex]]:
     """Solve all weights of the parts with changed tiles, until they agree with each other."""
-    settings = dataclasses.replace(settings, newton_steps=max(settings.newton_steps, _NEWTON_STEPS))
     parts = sorted({part_of(index) for index in changed})
     done: set[TileIndex] = set()
     for _ in range(_SWEEPS):
         for part in parts:
-            tiles, _ = refit(tiled, part, settings, moment, threads=threads)
+            tiles, _ = refit(tiled, part, moment, threads=threads, effort=_EFFORT)
             tiled = tiled._replace(tiles={**tiled.tiles, **tiles})
             done.update(tiles)
     done.update(changed)
     settled = {index: tiled.tiles[index] for index in done if index in tiled.tiles}
-    return tiled.with_tiles(settled, settings.observed_activation, threads=threads), done
+    return tiled.with_tiles(settled, OBSERVED_ACTIVATION, threads=threads), done

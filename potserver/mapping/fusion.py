@@ -6,10 +6,12 @@ Tiles around a scan age as it comes; of the others one part a scan, the stalest 
 
 from __future__ import annotations
 
+import dataclasses
 from typing import NamedTuple
 
 import numpy as np
 
+from potserver.domain.kernel_map import PRIOR_VAR
 from potserver.domain.tiles import (
     CARRIED,
     COARSE,
@@ -25,7 +27,8 @@ from potserver.domain.tiles import (
 )
 from potserver.domain.types import Bool, Float32, Float64, KernelSet
 from potserver.errors import SolverError
-from potserver.mapping.refinement import activation, gamma_of_spacing, kernels_at
+from potserver.mapping.placing import activation, gamma_of_spacing, kernels_at
+from potserver.mapping.refinement import FEATURE_CUT
 from potserver.mapping.settings import MappingSettings
 from potserver.numerics import evidence
 from potserver.numerics.beams import Beams, LabelledPoints, beam_weights
@@ -42,6 +45,50 @@ _EXPLAINED = 1.0  # activation by carried kernels at which the lattice adds none
 _LONGEST_STEP = 4.0  # Newton steps
 _UNSUPPORTED = 1e-5  # of a kernel's curvature: what no row within its reach leaves
 _STALE = 0.125  # half-lives after which a tile that no scan touches is fitted again
+_MEMORY = 200.0  # looks that one place remembers; older ones give way
+_SATURATION = 20.0  # looks at one place that count in a solve; further ones repeat them
+_CHEAP_VALUES = 60_000_000  # features that a solve may touch for more Newton steps than it must take
+
+
+class FitEffort(NamedTuple):
+    """Steps of one solve, from where the map is."""
+
+    newton_steps: int = 2  # at least
+    most_newton_steps: int = 6  # where the map is small and steps are cheap
+    gradient_steps: int = 4  # conjugate-gradient steps for each Newton step
+
+
+SCAN_EFFORT = FitEffort()
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class FusionOptions:
+    """How scans enter the overall map; the settings of the same names say more."""
+
+    free_gap_m: float
+    fade_rate: float
+    max_kernels_per_tile: int
+    effort: FitEffort
+
+    @staticmethod
+    def of(settings: MappingSettings, effort: FitEffort = SCAN_EFFORT) -> FusionOptions:
+        """What fusion needs of the settings."""
+        return FusionOptions(
+            free_gap_m=settings.free_gap_m,
+            fade_rate=settings.fade_rate,
+            max_kernels_per_tile=settings.max_kernels_per_tile,
+            effort=effort,
+        )
+
+
+class Look(NamedTuple):
+    """One scan, as the overall map learns from it."""
+
+    labelled: LabelledPoints  # map frame
+    beams: Beams  # relative to `origin`
+    origin: Float64  # (3,) m, map frame
+    source: int  # the robot's number in the map
+    is_planar: bool  # kernels stay in the plane of the points
 
 
 class Moment(NamedTuple):
@@ -67,40 +114,37 @@ class Fused(NamedTuple):
     converged: bool
 
 
-def grid_for(beams: Beams, settings: MappingSettings) -> TileGrid:
-    """The grid of a map that starts with these beams: far looks are spread thinly and need wider kernels."""
-    fine = settings.fine_m
-    if not fine:
+def grid_for(beams: Beams, tile_size_m: float, resolution_m: float = 0.0) -> TileGrid:
+    """The grid of a map that starts with these beams: far looks are spread thinly and need wider kernels.
+
+    Args:
+        beams: Of the first scan.
+        tile_size_m: Edge of a tile.
+        resolution_m: The one wanted; 0 takes a 20th of the median range, between 0.2 and 0.4 m.
+    """
+    if not resolution_m:
         length = np.linalg.norm(beams.ends[beams.is_return] if beams.is_return.any() else beams.ends, axis=1)
-        fine = float(np.clip(_FINE_PER_RANGE * np.median(length), _FINEST_M, _COARSEST_M))
-    return TileGrid.of(settings.tile_size_m, fine)
+        resolution_m = float(np.clip(_FINE_PER_RANGE * np.median(length), _FINEST_M, _COARSEST_M))
+    return TileGrid.of(tile_size_m, resolution_m)
 
 
 def fuse(
     tiled: TiledMap,
-    labelled: LabelledPoints,
-    beams: Beams,
-    origin: Float64,
+    look: Look,
     carried: KernelSet,
-    settings: MappingSettings,
-    *,
-    source: int,
+    options: FusionOptions,
     moment: Moment,
-    planar: bool,
+    *,
     threads: int,
 ) -> Fused:
     """Add a scan to the tiles around it, and solve all weights near it jointly on all evidence there.
 
     Args:
         tiled: The map; it is not changed.
-        labelled: The scan's points, map frame.
-        beams: The scan's beams, relative to `origin`.
-        origin: (3,) m, map frame.
-        carried: Transported kernels, map frame; weights and variances as prior.
-        settings: Of the pipeline.
-        source: The robot's number in the map.
+        look: The scan.
+        carried: Transported kernels that may join, map frame; their weights and variances are a prior. Mostly none.
+        options: How.
         moment: Of the change.
-        planar: Keep kernels in the plane of the points.
         threads: Threads of the solve.
     Raises:
         SolverError: the solve ended without numbers.
@@ -108,36 +152,51 @@ def fuse(
     """
     grid = tiled.grid
     pad = grid.coarse_m
-    lower, upper = bounds(labelled.points)
+    lower, upper = bounds(look.labelled.points)
     lower, upper = lower - pad, upper + pad
     region = Region.of(tiled, lower - 4 * pad, upper + 4 * pad, moment.weight_of)
-    points, occupied, weight = labelled.points - region.origin_m, labelled.occupied, beam_weights(labelled)
-    samples = points
-    if settings.fade_rate:
-        start = origin - region.origin_m
-        seen = evidence.see_through(
-            region.rows, beams.ends + start, beams.is_return, start, fine_m=grid.fine_m,
-            rate=settings.fade_rate, gap_m=settings.gap_m, threads=threads,
-        )  # fmt: skip
-        samples = np.concatenate([points, seen.points])
-        occupied = np.concatenate([occupied, np.zeros(len(seen.points), bool)])
-        weight = np.concatenate([weight, seen.weight])
     inside = lower - region.origin_m, upper - region.origin_m  # of tiles that are stored again
-    new_rows = add_evidence(
-        region, samples, occupied, weight, source, settings, within=inside, turn=moment.revision
-    )
+    samples = _samples_of(look, region, options, threads)
+    new_rows = add_evidence(region, samples, look.source, within=inside, turn=moment.revision)
     taken = KernelSet.empty()
-    if settings.carry_into_map:
+    if len(carried):
+        points = look.labelled.points - region.origin_m
         taken = _wanted(carried.moved(-region.origin_m), region.kernels, points, grid, threads)
         # samples may count at a row that a narrow kernel does not reach: the solve would only drop it
         where = evidence.positions(region.rows, grid.fine_m)
         taken = taken.take(_support(taken, where, grid, threads) >= _REACHED)
-    added = add_kernels(region, new_rows, MapKernels.new(taken, CARRIED), planar, settings, threads)
-    fitted = _fit(region, *inside, settings, threads)
+    added = add_kernels(region, new_rows, MapKernels.new(taken, CARRIED), options, look.is_planar, threads)
+    fitted = _fit(region, *inside, options.effort, threads)
     return Fused(
         region.tiles(lower, upper, revision=moment.revision, stamp_ns=moment.stamp_ns),
         len(added), int((added.level == CARRIED).sum()), fitted,
     )  # fmt: skip
+
+
+class Samples(NamedTuple):
+    """Labelled points with weights, in a region's frame."""
+
+    points: Float64  # (N, 3) m
+    occupied: Bool  # (N,)
+    weight: Float64 | Float32  # (N,) looks
+
+
+def _samples_of(look: Look, region: Region, options: FusionOptions, threads: int) -> Samples:
+    """A scan's points, and free ones where its beams see through what stood; the rows of that are weakened in place."""
+    points = look.labelled.points - region.origin_m
+    occupied, weight = look.labelled.occupied, beam_weights(look.labelled)
+    if not options.fade_rate:
+        return Samples(points, occupied, weight)
+    start = look.origin - region.origin_m
+    seen = evidence.see_through(
+        region.rows, look.beams.ends + start, look.beams.is_return, start, fine_m=region.grid.fine_m,
+        rate=options.fade_rate, gap_m=options.free_gap_m, threads=threads,
+    )  # fmt: skip
+    return Samples(
+        np.concatenate([points, seen.points]),
+        np.concatenate([occupied, np.zeros(len(seen.points), bool)]),
+        np.concatenate([weight, seen.weight]),
+    )
 
 
 def append(tiled: TiledMap, carried: KernelSet, moment: Moment) -> dict[TileIndex, Tile]:
@@ -167,7 +226,7 @@ def append(tiled: TiledMap, carried: KernelSet, moment: Moment) -> dict[TileInde
 
 
 def refit(
-    tiled: TiledMap, part: TileIndex, settings: MappingSettings, moment: Moment, *, threads: int
+    tiled: TiledMap, part: TileIndex, moment: Moment, *, threads: int, effort: FitEffort = SCAN_EFFORT
 ) -> tuple[dict[TileIndex, Tile], bool]:
     """Solve the weights of one part's kernels again, those around it held; its tiles, and whether the solve went well.
 
@@ -180,7 +239,7 @@ def refit(
     pad = 4 * grid.coarse_m
     region = Region.of(tiled, corner - pad, corner + edge + pad, moment.weight_of)
     start = corner - region.origin_m
-    fitted = _fit(region, start, start + edge, settings, threads)
+    fitted = _fit(region, start, start + edge, effort, threads)
     inner = corner + 1e-3 * grid.fine_m, corner + edge - 1e-3 * grid.fine_m
     tiles = region.tiles(*inner, revision=moment.revision, stamp_ns=moment.stamp_ns)
     return {index: tile for index, tile in tiles.items() if index in tiled.tiles}, fitted
@@ -196,23 +255,20 @@ def stalest_part(tiled: TiledMap, moment: Moment) -> TileIndex | None:
 
 def add_evidence(
     region: Region,
-    points: Float64,
-    occupied: Bool,
-    weight: Float64 | Float32,
+    samples: Samples,
     source: int,
-    settings: MappingSettings,
     *,
     within: tuple[Float64, Float64] | None = None,
     turn: int = 0,
 ) -> evidence.Rows:
-    """Put labelled samples, (N, 3) m in the region's frame, into its rows; the rows that are new.
+    """Put samples into a region's rows; the rows that are new.
 
     Within a box, old rows that say little join others: see `evidence.add_sparing`.
     """
     rows, gained, n_old = evidence.add_sparing(
-        region.rows, points, occupied, weight, region.grid.fine_m, source, within=within, turn=turn
+        region.rows, *samples, region.grid.fine_m, source, within=within, turn=turn
     )
-    evidence.forget(rows.sums, gained, evidence.cells(rows), settings.memory)
+    evidence.forget(rows.sums, gained, evidence.cells(rows), _MEMORY)
     region.rows = rows
     return rows.take(slice(n_old, None))
 
@@ -221,8 +277,8 @@ def add_kernels(
     region: Region,
     new_rows: evidence.Rows,
     taken: MapKernels,
+    options: FusionOptions,
     planar: bool,
-    settings: MappingSettings,
     threads: int,
 ) -> MapKernels:
     """Put kernels where new rows ask for them, beside those that are taken as they are; all that were added."""
@@ -242,12 +298,10 @@ def add_kernels(
         same_scale = from_atoms.take(_is_fine(from_atoms, grid) == (level == FINE))
         if len(same_scale) and len(nodes):
             nodes = nodes[activation(same_scale, nodes, threads=threads) < _EXPLAINED]
-        parts.append(MapKernels.new(kernels_at(nodes, spacing, settings.prior_var), level))
+        parts.append(MapKernels.new(kernels_at(nodes, spacing, PRIOR_VAR), level))
     added = MapKernels.concatenate(parts)
     added = added.take(
-        _fits_budget(
-            present.kernels.hinge_mean, added.kernels.hinge_mean, grid, settings.max_kernels_per_tile
-        )
+        _fits_budget(present.kernels.hinge_mean, added.kernels.hinge_mean, grid, options.max_kernels_per_tile)
     )
     region.kernels = MapKernels.concatenate([present, added])
     return added
@@ -302,7 +356,7 @@ def _fits_budget(present: Float64, added: Float64, grid: TileGrid, limit: int) -
     return place[len(present) :] < limit
 
 
-def _fit(region: Region, lower: Float64, upper: Float64, settings: MappingSettings, threads: int) -> bool:
+def _fit(region: Region, lower: Float64, upper: Float64, effort: FitEffort, threads: int) -> bool:
     """Solve the weights of the kernels in a box, those around it held; whether the solve went well.
 
     Rows and kernels beyond the reach of what is solved for are left out.
@@ -316,23 +370,23 @@ def _fit(region: Region, lower: Float64, upper: Float64, settings: MappingSettin
     local = np.flatnonzero(inside_box(kernels.hinge_mean, lower - 4 * pad, upper + 4 * pad))
     hinge = kernels.hinge_mean[local]
     free = inside_box(hinge, lower, upper)
-    counts = evidence.counts(region.rows.sums, evidence.cells(region.rows), settings.saturation)
+    counts = evidence.counts(region.rows.sums, evidence.cells(region.rows), _SATURATION)
     blocks = feature_blocks(
         where[rows],
         hinge,
         kernels.gamma[local],
         edge_m=grid.coarse_m,
-        cut=settings.feature_cut,
+        cut=FEATURE_CUT,
         bytes_a_value=1,
         threads=threads,
     )
-    per_step = blocks.n_values * (2 + 2 * settings.gradient_steps)
-    cheap = settings.cheap_values // max(per_step, 1)
+    per_step = blocks.n_values * (2 + 2 * effort.gradient_steps)
+    cheap = _CHEAP_VALUES // max(per_step, 1)
     fit = warm_fit(
         blocks, region.rows.occupied[rows], counts[rows], region.kernels.prior_mean[local],
         region.kernels.prior_var[local], kernels.weight_mean[local], free=free,
-        n_newton=int(np.clip(cheap, settings.newton_steps, 3 * settings.newton_steps)),
-        n_conjugate_gradient=settings.gradient_steps, longest_step=_LONGEST_STEP, threads=threads,
+        n_newton=int(np.clip(cheap, effort.newton_steps, effort.most_newton_steps)),
+        n_conjugate_gradient=effort.gradient_steps, longest_step=_LONGEST_STEP, threads=threads,
     )  # fmt: skip
     if not (np.isfinite(fit.weights).all() and np.isfinite(fit.var).all()):
         raise SolverError(f"the weights of {len(local)} kernels on {len(rows)} rows came out NaN or infinite")

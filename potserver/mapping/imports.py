@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from potserver.domain.kernel_map import KernelMap
+from potserver.domain.kernel_map import OBSERVED_ACTIVATION, KernelMap
 from potserver.domain.map_state import MapState
 from potserver.domain.tiles import Region, TiledMap, TileGrid
 from potserver.domain.types import Bool, Float32, Float64, KernelSet
 from potserver.errors import BadPointsError, EmptyError
-from potserver.mapping.fusion import Moment, add_evidence, append
+from potserver.mapping.fusion import Moment, Samples, add_evidence, append
 from potserver.mapping.service import MappingService
 
 
@@ -41,8 +41,8 @@ def state_of_places(
     for members in np.split(order, cuts):
         centre = (tile[members[0]] + 0.5) * grid.size_m
         region = Region.of(tiled, centre, centre)
-        local = points[members] - region.origin_m
-        add_evidence(region, local, occupied[members], weight[members], number, service.settings)
+        samples = Samples(points[members] - region.origin_m, occupied[members], weight[members])
+        add_evidence(region, samples, number)
         tiled = tiled._replace(
             tiles={**tiled.tiles, **region.tiles(centre, centre)}
         )  # without kernels: nothing to index
@@ -63,9 +63,9 @@ def state_of_kernels(service: MappingService, kernels: KernelSet) -> MapState:
     if len(kernels) == 0:
         raise EmptyError("there are no kernels in it: no map can be made")
     settings = service.settings
-    tiled = TiledMap.empty(TileGrid.of(settings.tile_size_m, settings.fine_m or 0.2))
+    tiled = TiledMap.empty(TileGrid.of(settings.tile_size_m, settings.resolution_m or 0.2))
     tiles = append(tiled, kernels, Moment(1, 0))
-    tiled = tiled.with_tiles(tiles, settings.observed_activation)
+    tiled = tiled.with_tiles(tiles, OBSERVED_ACTIVATION)
     empty = KernelMap(KernelSet.empty(), map_revision=1)
     service.restore(MapState(snapshot=empty, tiled=tiled))
     return service.state

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from enum import Enum
 from typing import NamedTuple
 
 import numpy as np
@@ -9,9 +10,38 @@ from numpy.typing import NDArray
 
 from potserver.domain.dictionary import AtomDictionary
 from potserver.domain.types import Atom, Float32, Float64, Sector
-from potserver.mapping.settings import MappingSettings, RankScore
 from potserver.numerics.coupling import CouplingCosts, Ragged, coupling_costs
 from potserver.numerics.geometry import rotation_z, thin
+
+
+class RankScore(str, Enum):
+    """How atoms are ranked against a sector."""
+
+    W2 = "w2"  # eq. 7: squared 2-Wasserstein distance of hits plus that of free points
+    NORMALISED = (
+        "normalised"  # the authors' code: each divided by its largest over all candidates, then added
+    )
+
+
+class Ranking(NamedTuple):
+    """How atoms are compared with sectors (eq. 6-7)."""
+
+    n_hits: int = 48  # points compared, at most; cost grows with their square
+    n_free: int = 32
+    voxel_m: float = 0.4  # points are thinned to one a voxel first; 0 draws them at random
+    reg_m2: float = (
+        5.0  # weight of the entropy: a blur of about 2 m ranks as a sharper plan does, in a tenth of the time
+    )
+    tolerance: float = 3e-2  # of the marginals, in L1: enough to rank
+    max_iterations: int = 1000
+    score: RankScore = RankScore.W2
+    rotations_deg: tuple[float, ...] = (
+        -30.0,
+        -15.0,
+        0.0,
+        15.0,
+        30.0,
+    )  # of the atom: sectors are 60 degrees wide
 
 
 class Match(NamedTuple):
@@ -39,21 +69,19 @@ def _mean(points: Float32) -> Float64:
 class Matcher:
     """Ranks every atom of a dictionary, in every rotation, against the sectors of a scan."""
 
-    def __init__(
-        self, dictionary: AtomDictionary, settings: MappingSettings, *, threads: int, seed: int
-    ) -> None:
+    def __init__(self, dictionary: AtomDictionary, ranking: Ranking, *, threads: int, seed: int) -> None:
         """Subsample, centre and rotate the atoms once."""
-        self._settings = settings
+        self._ranking = ranking
         self._threads = threads
         self._seed = seed
         rng = np.random.default_rng(seed)
         self._candidates: list[tuple[Atom, float]] = []
         hits, free, free_alone = _Side(), _Side(), _Side()
         for atom in dictionary:
-            h = self._subsample(atom.hit_points, settings.rank_hits, rng)
-            f = self._subsample(atom.free_points, settings.rank_free, rng)
+            h = self._subsample(atom.hit_points, ranking.n_hits, rng)
+            f = self._subsample(atom.free_points, ranking.n_free, rng)
             centre = _mean(atom.hit_points if len(h) else atom.free_points)
-            for angle in np.deg2rad(settings.rotations_deg):
+            for angle in np.deg2rad(ranking.rotations_deg):
                 rotation = rotation_z(float(angle))
                 self._candidates.append((atom, float(angle)))
                 hits.add((h - centre) @ rotation.T)
@@ -68,10 +96,10 @@ class Matcher:
             _Batch(side, len(sectors)) for side in (self._hits, self._free, self._free_alone)
         )
         for number, sector in enumerate(sectors):
-            f = self._subsample(sector.free_points, self._settings.rank_free, rng)
+            f = self._subsample(sector.free_points, self._ranking.n_free, rng)
             if len(sector.hit_points):
                 centre = _mean(sector.hit_points)
-                hits.add(number, self._subsample(sector.hit_points, self._settings.rank_hits, rng) - centre)
+                hits.add(number, self._subsample(sector.hit_points, self._ranking.n_hits, rng) - centre)
                 free.add(number, f - centre)
             else:
                 alone.add(number, f - _mean(sector.free_points))
@@ -81,13 +109,13 @@ class Matcher:
         ]
 
     def _subsample(self, points: Float32, n: int, rng: np.random.Generator) -> Float32:
-        return points[thin(points, n, self._settings.rank_voxel_m, rng)]
+        return points[thin(points, n, self._ranking.voxel_m, rng)]
 
     def _solve(self, batch: _Batch) -> CouplingCosts:
-        s = self._settings
+        r = self._ranking
         return coupling_costs(
             Ragged.of(batch.side.sets), Ragged.of(batch.targets), np.asarray(batch.pairs, np.int64).reshape(-1, 2),
-            reg=s.rank_reg_m2, tolerance=s.rank_tolerance, max_iterations=s.rank_iterations, threads=self._threads,
+            reg=r.reg_m2, tolerance=r.tolerance, max_iterations=r.max_iterations, threads=self._threads,
         )  # fmt: skip
 
     def _best(self, costs_by_label: list[Float64 | None]) -> Match | None:
@@ -97,7 +125,7 @@ class Matcher:
             return None
         w2 = np.sum(compared, axis=0)
         score = w2
-        if self._settings.rank_score is RankScore.NORMALISED:
+        if self._ranking.score is RankScore.NORMALISED:
             score = np.sum(
                 [c / max(float(c[np.isfinite(c)].max(initial=0.0)), 1e-12) for c in compared], axis=0
             )

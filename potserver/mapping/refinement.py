@@ -1,4 +1,4 @@
-"""Refine weights with a scan's labels (RePOT, paper section III-D), and put kernels on data.
+"""A scan's own map: the weights of carried kernels are solved on the scan's labels (RePOT, paper section III-D).
 
 All weights are solved jointly, the prior stays fixed and every datum counts once.
 """
@@ -11,36 +11,26 @@ import numpy as np
 
 from potserver.domain.types import Bool, Float32, Float64, KernelSet
 from potserver.errors import SolverError
+from potserver.numerics import evidence
+from potserver.numerics.beams import LabelledPoints, beam_weights
 from potserver.numerics.feature_blocks import feature_blocks
-from potserver.numerics.kernel_index import build_index, latent_sums
+from potserver.numerics.geometry import bounds
 from potserver.numerics.warm_fit import warm_fit
 
-_GAMMA_SHAPE = 100.0  # a placed kernel's width is known to 10 %
+FEATURE_CUT = 0.02  # activations below this are left out of solves
+_VOXEL = 2.0  # resolutions: the free points of such a voxel are one datum, the hits of half of it
+_CUBE = 2.5  # voxels along a cube whose rows are solved together: some twenty rows a cube
+_BORROWED_VAR_PER_M2 = 10.0  # log-odds^2 for each m^2; see `borrowed_prior`
 
 
-def gamma_of_spacing(spacing_m: float) -> float:
-    """1/m^2: the width at which kernels of this spacing overlap smoothly, a length-scale of 0.6 spacings."""
-    return 0.5 / (0.6 * spacing_m) ** 2
+class Effort(NamedTuple):
+    """Steps of a solve."""
+
+    newton_steps: int
+    gradient_steps: int  # conjugate-gradient steps for each Newton step
 
 
-def kernels_at(hinge: Float64, spacing_m: float, prior_var: float) -> KernelSet:
-    """Kernels of a spacing's width at (K, 3) m, weight 0 with the prior variance, log-odds^2."""
-    k = len(hinge)
-    return KernelSet(
-        hinge_mean=hinge,
-        hinge_var=np.full((k, 3), spacing_m**2 / 12.0, np.float32),  # uniform in the voxel
-        gamma_shape=np.full(k, _GAMMA_SHAPE, np.float32),
-        gamma_rate=np.full(k, _GAMMA_SHAPE / gamma_of_spacing(spacing_m), np.float32),
-        weight_mean=np.zeros(k, np.float32),
-        weight_var=np.full(k, prior_var, np.float32),
-    )
-
-
-def activation(kernels: KernelSet, points: Float64, *, threads: int) -> np.ndarray:
-    """(N,) sum of phi at each point."""
-    zeros = np.zeros(len(kernels))
-    index = build_index(kernels.hinge_mean, kernels.gamma, zeros, zeros, activation_cut=0.01, tau=1.0)
-    return latent_sums(index, points, threads=threads).activation
+INSTANT_EFFORT = Effort(newton_steps=4, gradient_steps=8)
 
 
 class Refined(NamedTuple):
@@ -50,46 +40,81 @@ class Refined(NamedTuple):
     converged: bool
 
 
-def refine(
-    kernels: KernelSet,
-    points: Float64,
-    occupied: Bool,
-    *,
-    edge_m: float,
-    feature_cut: float,
-    newton_steps: int,
-    gradient_steps: int,
-    threads: int,
-    sample_weight: Float32 | None = None,
-) -> Refined:
-    """Solve all weights of `kernels` jointly on labelled points; their present mean and variance are the prior.
-
-    The solve starts from weights of 0: transported ones are the prior, but as a start they are far off where the scenes differ.
+def borrowed_prior(carried: KernelSet, w2_m2: float) -> KernelSet:
+    """Carried kernels as a prior: borrowed knowledge is worth less the farther it was carried.
 
     Args:
-        kernels: In the frame of the points.
+        carried: With the weights of their atom.
+        w2_m2: Squared 2-Wasserstein distance between atom and sector; the entropy may make it negative.
+    """
+    borrowed = np.float32(_BORROWED_VAR_PER_M2 * max(w2_m2, 0.0))
+    return carried.replace(weight_var=carried.weight_var + borrowed)
+
+
+def flat_prior(carried: KernelSet, prior_var: float) -> KernelSet:
+    """Carried kernels of which only positions and widths count: weights 0 with the prior variance, log-odds^2."""
+    zeros = np.zeros(len(carried), np.float32)
+    return carried.replace(weight_mean=zeros, weight_var=zeros + np.float32(prior_var))
+
+
+def instantaneous_map(
+    prior: KernelSet, labelled: LabelledPoints, resolution_m: float, *, threads: int
+) -> Refined:
+    """What one scan says by the kernels that were carried to it.
+
+    Args:
+        prior: K kernels, map frame; their weights' mean and variance are the prior.
+        labelled: The scan's points, map frame; those of one voxel are one datum.
+        resolution_m: Of the map.
+        threads: Threads of the solve.
+    Raises:
+        SolverError: the solve ended without numbers.
+    """
+    voxel_m = _VOXEL * resolution_m
+    corner = bounds(labelled.points)[0]
+    rows, _ = evidence.add(
+        evidence.Rows.empty(), labelled.points - corner, labelled.occupied, beam_weights(labelled), voxel_m
+    )
+    points = evidence.positions(rows, voxel_m) + corner
+    return refine(prior, points, rows.occupied, rows.sums[:, 3], edge_m=_CUBE * voxel_m, threads=threads)
+
+
+def refine(
+    prior: KernelSet,
+    points: Float64,
+    occupied: Bool,
+    counts: Float32,
+    *,
+    edge_m: float,
+    effort: Effort = INSTANT_EFFORT,
+    threads: int,
+) -> Refined:
+    """Solve all weights jointly on labelled points.
+
+    The solve starts from weights of 0: carried ones are the prior, but as a start they are far off where scenes differ.
+
+    Args:
+        prior: K kernels in the frame of the points; their weights' mean and variance are the prior.
         points: (N, 3) m.
         occupied: (N,) their labels.
+        counts: (N,) how much each point counts.
         edge_m: Of the cubes that points are solved in; some twenty points to a cube are good.
-        feature_cut: Activations below this are left out of the solve.
-        newton_steps, gradient_steps: Newton steps, and conjugate-gradient steps for each.
+        effort: Steps of the solve.
         threads: Threads of the solve.
-        sample_weight: (N,) how much each point counts; 1 by default.
     Raises:
         SolverError: the solve ended without numbers.
     """
     corner = points.min(axis=0) if len(points) else np.zeros(3)
     blocks = feature_blocks(
-        points - corner, kernels.hinge_mean - corner, kernels.gamma, edge_m=edge_m, cut=feature_cut,
-        bytes_a_value=1, threads=threads,
+        points - corner, prior.hinge_mean - corner, prior.gamma, edge_m=edge_m, cut=FEATURE_CUT, bytes_a_value=1,
+        threads=threads,
     )  # fmt: skip
-    counts = np.ones(len(points), np.float32) if sample_weight is None else sample_weight
     fit = warm_fit(
-        blocks, occupied, counts, kernels.weight_mean, kernels.weight_var, np.zeros_like(kernels.weight_mean),
-        n_newton=newton_steps, n_conjugate_gradient=gradient_steps, threads=threads,
+        blocks, occupied, counts, prior.weight_mean, prior.weight_var, np.zeros_like(prior.weight_mean),
+        n_newton=effort.newton_steps, n_conjugate_gradient=effort.gradient_steps, threads=threads,
     )  # fmt: skip
     if not (np.isfinite(fit.weights).all() and np.isfinite(fit.var).all()):
         raise SolverError(
-            f"the weights of {len(kernels)} kernels on {len(points)} points came out NaN or infinite"
+            f"the weights of {len(prior)} kernels on {len(points)} points came out NaN or infinite"
         )
-    return Refined(kernels.replace(weight_mean=fit.weights, weight_var=fit.var), fit.converged)
+    return Refined(prior.replace(weight_mean=fit.weights, weight_var=fit.var), fit.converged)

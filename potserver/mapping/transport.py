@@ -8,12 +8,28 @@ import numpy as np
 
 from potserver.domain.types import Float32, KernelSet, Sector
 from potserver.mapping.matching import Match, shared_centres
-from potserver.mapping.settings import MappingSettings
 from potserver.numerics.coupling import Coupling, couple
-from potserver.numerics.displacement import carry
+from potserver.numerics.displacement import OutOfSample, carry
 from potserver.numerics.geometry import in_sector, rotated_diagonal, rotation_z, thin
 
 _RETRY_REG_FACTOR = 4.0  # an unconverged coupling is solved once more, blurrier
+
+
+class CouplingOptions(NamedTuple):
+    """How an atom is coupled to its sector, and what moves with the coupling (eq. 3-4)."""
+
+    n_points: int = 200  # of each label and side, at most
+    voxel_m: float = 0.25  # points are thinned to one a voxel first; 0 draws them at random
+    reg: float = 0.002  # weight of the entropy, as a share of the largest cost
+    tolerance: float = 1e-3  # of the marginals, in L1
+    max_iterations: int = 2000
+    is_label_aware: bool = (
+        True  # free-space kernels move with the free points' own coupling; false: with the hits'
+    )
+    stays_in_sector: bool = (
+        True  # kernels carried out of their sector are left out; false: only those out of the circle
+    )
+    out_of_sample: OutOfSample = OutOfSample.NEAREST
 
 
 class Transported(NamedTuple):
@@ -25,7 +41,7 @@ class Transported(NamedTuple):
     n_iterations: int
 
 
-def transport(match: Match, sector: Sector, settings: MappingSettings, seed: int) -> Transported:
+def transport(match: Match, sector: Sector, options: CouplingOptions, seed: int) -> Transported:
     """Move all ten parameters of every kernel of the matched atom.
 
     Positions go with the coupling; dispersions of position turn with the atom; gamma, weight and their dispersions go along
@@ -38,18 +54,18 @@ def transport(match: Match, sector: Sector, settings: MappingSettings, seed: int
     solved: list[Coupling] = []
 
     def move(members: np.ndarray, source: Float32, target: Float32) -> None:
-        x = ((_subsample(source, settings, rng) - source_centre) @ rotation.T).astype(np.float32)
-        y = (_subsample(target, settings, rng) - target_centre).astype(np.float32)
-        coupling = _couple(x, y, settings)
+        x = ((_subsample(source, options, rng) - source_centre) @ rotation.T).astype(np.float32)
+        y = (_subsample(target, options, rng) - target_centre).astype(np.float32)
+        coupling = _couple(x, y, options)
         solved.append(coupling)
         if coupling.converged:
-            hinge[members] = carry(hinge[members], x, y, coupling, settings.out_of_sample)
+            hinge[members] = carry(hinge[members], x, y, coupling, options.out_of_sample)
 
     hits = bool(len(atom.hit_points) and len(sector.hit_points))
     free = bool(len(atom.free_points) and len(sector.free_points))
     occupied = atom.kernels.weight_mean > 0
     carried = np.ones(len(hinge), bool)
-    if settings.label_aware and free:
+    if options.is_label_aware and free:
         move(~occupied, atom.free_points, sector.free_points)
         if hits:
             move(occupied, atom.hit_points, sector.hit_points)
@@ -65,7 +81,7 @@ def transport(match: Match, sector: Sector, settings: MappingSettings, seed: int
     if not converged:
         return Transported(KernelSet.empty(), False, error, iterations)
     hinge += target_centre
-    keep = carried & in_sector(hinge, *_keep_bounds(sector, settings))
+    keep = carried & in_sector(hinge, *_keep_bounds(sector, options))
     R, t = sector.T_map_sector[:3, :3], sector.T_map_sector[:3, 3]
     kernels = atom.kernels.take(keep)
     return Transported(
@@ -78,22 +94,22 @@ def transport(match: Match, sector: Sector, settings: MappingSettings, seed: int
     )
 
 
-def _keep_bounds(sector: Sector, settings: MappingSettings) -> tuple[float, float, float]:
+def _keep_bounds(sector: Sector, options: CouplingOptions) -> tuple[float, float, float]:
     """Azimuths in the sector frame and radius that transported kernels must lie in."""
-    if not settings.keep_in_sector:
+    if not options.stays_in_sector:
         return -np.pi, np.pi + 1e-9, sector.radius_m
     return sector.azimuth_min_rad, sector.azimuth_max_rad, sector.radius_m
 
 
-def _subsample(points: Float32, settings: MappingSettings, rng: np.random.Generator) -> Float32:
-    return points[thin(points, settings.couple_points, settings.couple_voxel_m, rng)]
+def _subsample(points: Float32, options: CouplingOptions, rng: np.random.Generator) -> Float32:
+    return points[thin(points, options.n_points, options.voxel_m, rng)]
 
 
-def _couple(x: Float32, y: Float32, settings: MappingSettings) -> Coupling:
+def _couple(x: Float32, y: Float32, options: CouplingOptions) -> Coupling:
     for factor in (1.0, _RETRY_REG_FACTOR):
         coupling = couple(
-            x, y, reg=settings.couple_reg * factor, tolerance=settings.couple_tolerance,
-            max_iterations=settings.couple_iterations,
+            x, y, reg=options.reg * factor, tolerance=options.tolerance,
+            max_iterations=options.max_iterations,
         )  # fmt: skip
         if coupling.converged:
             break

@@ -12,9 +12,10 @@ import pytest
 from potserver.domain.dictionary import AtomDictionary
 from potserver.domain.types import KernelSet, Scan, yaw_pose
 from potserver.mapping.matching import Match
+from potserver.mapping.paper import PAPER
 from potserver.mapping.service import MappingService
-from potserver.mapping.settings import PAPER, MappingSettings
-from potserver.mapping.transport import transport
+from potserver.mapping.settings import MappingSettings
+from potserver.mapping.transport import CouplingOptions, transport
 from potserver.numerics.beams import Beams, label_beams
 from potserver.numerics.geometry import rotation_z
 from tests.conformance import reference
@@ -53,7 +54,7 @@ def test_algorithm1_finds_the_atom_that_a_scan_was_made_from(dims: int, turn_deg
         robot_id="r", seq=0, stamp_ns=0, points=chosen.hit_points, is_return=np.ones(len(chosen.hit_points), bool),
         T_map_sensor=pose, is_planar=dims == 2,
     )  # fmt: skip
-    service = MappingService(AtomDictionary(tuple(atoms)), PAPER, threads=2)
+    service = MappingService(AtomDictionary(tuple(atoms)), MappingSettings.of_profile("paper"), threads=2)
     update = service.integrate(scan)
     served = [s for s in update.sectors if s.atom_id is not None]
     assert len(served) == 1, "all hits lie in one sector"
@@ -97,7 +98,7 @@ def _ring_atom():
 def test_row_a14_the_paper_crops_to_a_full_circle_about_the_sensor() -> None:
     atom = _ring_atom()
     sector = reference.sector(atom.hit_points, atom.free_points)
-    carried = transport(Match(atom, 0.0, 0.0), sector, PAPER, seed=0)
+    carried = transport(Match(atom, 0.0, 0.0), sector, PAPER.coupling, seed=0)
     assert carried.converged
     radius = np.hypot(carried.kernels.hinge_mean[:, 0], carried.kernels.hinge_mean[:, 1])
     bearing = np.arctan2(carried.kernels.hinge_mean[:, 1], carried.kernels.hinge_mean[:, 0])
@@ -108,9 +109,8 @@ def test_row_a14_the_paper_crops_to_a_full_circle_about_the_sensor() -> None:
 
 def test_the_default_profile_crops_to_the_sector() -> None:
     atom = _ring_atom()
-    settings = dataclasses.replace(MappingSettings(), max_range_m=20.0, keep_in_sector=True)
     sector = reference.sector(atom.hit_points, atom.free_points)
-    carried = transport(Match(atom, 0.0, 0.0), sector, settings, seed=0)
+    carried = transport(Match(atom, 0.0, 0.0), sector, CouplingOptions(), seed=0)
     bearing = np.arctan2(carried.kernels.hinge_mean[:, 1], carried.kernels.hinge_mean[:, 0])
     assert 9 <= len(carried.kernels) <= 18
     assert np.abs(bearing).max() <= math.radians(36.0)

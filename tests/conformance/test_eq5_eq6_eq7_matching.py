@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from potserver.domain.dictionary import AtomDictionary
-from potserver.mapping.matching import Matcher
-from potserver.mapping.settings import MappingSettings, RankScore
+from potserver.mapping.matching import Matcher, Ranking, RankScore
 from potserver.numerics.geometry import rotation_z
 from tests.conformance import reference
 
@@ -19,14 +18,9 @@ REG = 12.5
 BOX = ((-6.0, -6.0, -1.0), (6.0, 6.0, 2.0))
 
 
-def _settings(score: RankScore) -> MappingSettings:
-    return MappingSettings(
-        rank_score=score,
-        rank_reg_m2=REG,
-        rank_tolerance=1e-5,
-        rotations_deg=ROTATIONS_DEG,
-        rank_hits=200,
-        rank_free=200,
+def _ranking(score: RankScore) -> Ranking:
+    return Ranking(
+        score=score, reg_m2=REG, tolerance=1e-5, rotations_deg=ROTATIONS_DEG, n_hits=200, n_free=200
     )
 
 
@@ -70,7 +64,7 @@ def test_eq6_eq7_choice_equals_brute_force(score: RankScore, seed: int) -> None:
         hits = reference.rotated(source.hit_points, angle) * rng.uniform(0.8, 1.2, 3) + offset
         free = reference.rotated(source.free_points, angle) + rng.normal(0.0, 0.5, 3) + offset
         sectors.append(reference.sector(_apart(hits), _apart(free)))
-    found = Matcher(AtomDictionary(tuple(atoms)), _settings(score), threads=2, seed=0).match(sectors)
+    found = Matcher(AtomDictionary(tuple(atoms)), _ranking(score), threads=2, seed=0).match(sectors)
     for sector, match in zip(sectors, found, strict=True):
         truth = reference.rank(atoms, ROTATIONS, sector, REG)
         wanted = truth.w2 if score is RankScore.W2 else truth.normalised
@@ -97,7 +91,7 @@ def test_the_two_scores_are_not_the_same_rule() -> None:
     truth = reference.rank(atoms, ROTATIONS, target, REG)
     chosen = {}
     for score in RankScore:
-        match = Matcher(AtomDictionary(tuple(atoms)), _settings(score), threads=1, seed=0).match([target])[0]
+        match = Matcher(AtomDictionary(tuple(atoms)), _ranking(score), threads=1, seed=0).match([target])[0]
         assert match is not None
         wanted = truth.w2 if score is RankScore.W2 else truth.normalised
         assert match.atom is atoms[int(wanted.min(axis=1).argmin())]
@@ -115,7 +109,7 @@ def test_row_a9_a_sector_with_one_label_is_ranked_by_that_label(score: RankScore
     target = reference.sector(hits, free)
     truth = reference.rank(atoms, ROTATIONS, target, REG)
     a, r = (int(i) for i in np.unravel_index(int(truth.w2.argmin()), truth.w2.shape))
-    match = Matcher(AtomDictionary(tuple(atoms)), _settings(score), threads=1, seed=0).match([target])[0]
+    match = Matcher(AtomDictionary(tuple(atoms)), _ranking(score), threads=1, seed=0).match([target])[0]
     assert match is not None
     assert (match.atom.atom_id, match.rotation_rad) == (atoms[a].atom_id, pytest.approx(ROTATIONS[r]))
 
@@ -128,19 +122,19 @@ def test_row_a10_an_atom_without_hits_never_serves_a_sector_with_hits() -> None:
     poor = reference.atom("poor", _apart(hits * 2.5), _apart(free * 2.5))
     target = reference.sector(hits, free)
     for atoms in ((poor, no_hits), (no_hits, poor)):
-        match = Matcher(AtomDictionary(atoms), _settings(RankScore.W2), threads=1, seed=0).match([target])[0]
+        match = Matcher(AtomDictionary(atoms), _ranking(RankScore.W2), threads=1, seed=0).match([target])[0]
         assert match is not None
         assert match.atom.atom_id == "poor"
-    assert Matcher(AtomDictionary((no_hits,)), _settings(RankScore.W2), threads=1, seed=0).match(
-        [target]
-    ) == [None]
+    assert Matcher(AtomDictionary((no_hits,)), _ranking(RankScore.W2), threads=1, seed=0).match([target]) == [
+        None
+    ]
 
 
 def test_row_c20_the_choice_does_not_depend_on_where_the_sector_lies() -> None:
     atoms = _atoms(7)
     rng = np.random.default_rng(8)
     hits, free = reference.spaced(rng, 30, *BOX, 0.8), reference.spaced(rng, 25, *BOX, 0.8)
-    matcher = Matcher(AtomDictionary(tuple(atoms)), _settings(RankScore.W2), threads=1, seed=0)
+    matcher = Matcher(AtomDictionary(tuple(atoms)), _ranking(RankScore.W2), threads=1, seed=0)
     # whole voxels of the ranking's filter, so that it keeps the same points
     sectors = [
         reference.sector(hits + shift, free + shift)
@@ -156,7 +150,7 @@ def test_row_c20_the_choice_does_not_depend_on_where_the_sector_lies() -> None:
 
 def test_row_c20_scale_does_matter_whatever_the_paper_says() -> None:
     atoms = _atoms(9, 1)
-    matcher = Matcher(AtomDictionary(tuple(atoms)), _settings(RankScore.W2), threads=1, seed=0)
+    matcher = Matcher(AtomDictionary(tuple(atoms)), _ranking(RankScore.W2), threads=1, seed=0)
     same, larger = matcher.match(
         [reference.sector(s * atoms[0].hit_points, s * atoms[0].free_points) for s in (1.0, 1.5)]
     )

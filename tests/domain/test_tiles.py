@@ -11,7 +11,7 @@ from potserver.domain.kernel_map import KernelMap
 from potserver.domain.tiles import CARRIED, COARSE, MapKernels, Region, TiledMap, TileGrid
 from potserver.domain.types import Float64, KernelSet
 from potserver.errors import SettingsError, ShapeError
-from potserver.mapping.refinement import kernels_at
+from potserver.mapping.placing import kernels_at
 from potserver.numerics.evidence import add, positions
 
 GRID = TileGrid.of(10.0, 0.4)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 from pathlib import Path
 
@@ -12,11 +11,14 @@ import pytest
 from potclient.datasets import RecordedScan, Recording, open_dataset
 from potclient.holdout import HoldOut
 from potserver import AtomDictionary, MappingSettings, cli
-from potserver.commands.eval import to_markdown, variants
+from potserver.atoms.build.scan_task import to_scan
+from potserver.commands.eval import to_markdown
 from potserver.domain.kernel_map import KernelMap
 from potserver.errors import EmptyError
+from potserver.evaluation.ablations import ABLATIONS
 from potserver.evaluation.mappers import Mapper, ServiceMap, Size, kernel_bytes
 from potserver.evaluation.protocol import evaluate
+from potserver.mapping.service import MappingService
 
 WALL_M = 4.0
 
@@ -188,16 +190,24 @@ def test_towns_are_asked_about_their_truth() -> None:
         assert metrics.n > 30
 
 
-def test_ablations_differ_from_the_map_in_what_their_names_say() -> None:
-    found = variants(MappingSettings(n_sectors=4), ablations=True)
-    assert list(found) == ["default", "POT, not refined", "RePOT, transported prior", "RePOT, flat prior"]
-    assert all(settings.n_sectors == 4 for settings in found.values())
-    assert not found["POT, not refined"].refine
-    carried, flat = found["RePOT, transported prior"], found["RePOT, flat prior"]
-    assert carried.carry_into_map
-    assert carried.borrow_weights
-    assert dataclasses.replace(flat, borrow_weights=True) == carried
-    assert list(variants(MappingSettings(), ablations=False)) == ["default"]
+def test_ablations_are_what_their_names_say() -> None:
+    assert list(ABLATIONS) == ["POT, not refined", "RePOT, transported prior", "RePOT, flat prior"]
+    rows = {
+        name: MappingService(threads=2, make_pipeline=make_pipeline)
+        for name, make_pipeline in ABLATIONS.items()
+    }
+    updates = {name: service.integrate(to_scan(Wall()[0], 0)) for name, service in rows.items()}
+    pot, repot, flat = updates.values()
+    assert not rows["POT, not refined"].keeps_evidence
+    assert pot.n_kernels_added == pot.n_kernels_transported == len(pot.kernels) > 0
+    for update in (repot, flat):
+        assert 0 < update.n_kernels_transported < update.n_kernels_added
+    priors = {
+        name: np.concatenate([tile.kernels.prior_mean for tile in service.state.tiled.tiles.values()])
+        for name, service in rows.items()
+    }
+    assert np.abs(priors["RePOT, transported prior"]).max() > 0.1
+    np.testing.assert_array_equal(priors["RePOT, flat prior"], 0.0)
 
 
 def test_our_map_is_the_services() -> None:

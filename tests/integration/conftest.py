@@ -334,7 +334,6 @@ def real_server() -> Iterator[MapServer]:
             "limits.max_query_points": 2000,
             "limits.max_grid_cells": 50_000,
             "limits.max_coordinate_m": 1e6,
-            "queries.grid_part_cells": 4096,
         }
     )
     with MapServer(settings, listen="tcp/127.0.0.1:0") as server:

@@ -11,7 +11,9 @@ import pytest
 from potserver.domain.dictionary import AtomDictionary
 from potserver.domain.types import Float64, Occupancy, Scan, yaw_pose
 from potserver.errors import BadPoseError, SettingsError, UnknownRobotError, UnsupportedError
-from potserver.mapping.service import MappingService
+from potserver.mapping.default import DefaultPipeline
+from potserver.mapping.pipeline import Method
+from potserver.mapping.service import MappingService, pipeline_of
 from potserver.mapping.settings import MappingSettings
 
 HALF = np.array([6.0, 4.0, 1.5])  # m, of a room
@@ -19,10 +21,17 @@ HOUR_NS = 3_600_000_000_000
 AWAY = np.array([60.0, 0.0, 0.0])  # m, to the room beside
 
 
-def _service(profile: str = "default", **changes) -> MappingService:
-    settings = dataclasses.replace(MappingSettings.of_profile(profile), fine_m=0.4, **changes)
+def _service(profile: str = "default", *, uncalibrated: bool = False, **changes) -> MappingService:
+    settings = dataclasses.replace(MappingSettings.of_profile(profile), resolution_m=0.4, **changes)
     atoms = AtomDictionary(()) if profile == "default" else None
-    return MappingService(atoms, settings, threads=1)
+    return MappingService(
+        atoms, settings, threads=1, make_pipeline=_uncalibrated if uncalibrated else pipeline_of
+    )
+
+
+def _uncalibrated(settings: MappingSettings, *, threads: int, seed: int) -> DefaultPipeline:
+    """Answers by one rule, whatever the self-check finds."""
+    return DefaultPipeline(settings, Method(is_calibrated=False), threads=threads, seed=seed)
 
 
 def _scan(
@@ -133,8 +142,8 @@ def test_a_robot_is_taken_out_again() -> None:
     far = [_scan(10 + k, "b", room=60.0) for k in range(2)]
     near = [_scan(20 + k, "b") for k in range(2)]
     # checked beams are not taken out: a calibration by more of them may choose otherwise
-    alone = _fed(*ours, fade_rate=0.0, calibrate=False)
-    service = _fed(*ours, *far, *near, fade_rate=0.0, calibrate=False)
+    alone = _fed(*ours, fade_rate=0.0, uncalibrated=True)
+    service = _fed(*ours, *far, *near, fade_rate=0.0, uncalibrated=True)
     points, occupied = _asked()
     assert service.snapshot.occupancy(points + AWAY).observed.mean() > 0.95
     service.remove_robot("b")

@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 
 from potserver.domain.dictionary import AtomDictionary
+from potserver.domain.kernel_map import PRIOR_VAR
 from potserver.domain.tiles import CARRIED, COARSE, FINE, TiledMap
 from potserver.domain.types import KernelSet, Scan, yaw_pose
 from potserver.errors import SettingsError, SolverError
+from potserver.evaluation.ablations import ABLATIONS
 from potserver.mapping import fusion
 from potserver.mapping.fusion import grid_for
 from potserver.mapping.service import MappingService
@@ -68,10 +70,10 @@ def _same(one: KernelSet, other: KernelSet) -> None:
 def test_the_resolution_follows_the_first_scans_range(median_m: float, fine_m: float) -> None:
     ends = np.array([[median_m, 0, 0], [0, median_m, 0], [0, 0.31, 0], [90.0, 0, 0], [95.0, 0, 0]])
     beams = Beams(ends, np.array([True, True, True, True, False]))
-    assert grid_for(beams, MappingSettings()).fine_m == pytest.approx(fine_m, rel=0.12)
+    assert grid_for(beams, 10.0).fine_m == pytest.approx(fine_m, rel=0.12)
     free = Beams(ends, np.zeros(5, bool))
-    assert grid_for(free, MappingSettings()).fine_m > 0
-    assert grid_for(beams, MappingSettings(fine_m=1.0)).fine_m == 1.0
+    assert grid_for(free, 10.0).fine_m > 0
+    assert grid_for(beams, 10.0, 1.0).fine_m == 1.0
 
 
 def test_the_resolution_stays_until_the_map_is_cleared() -> None:
@@ -235,7 +237,7 @@ def test_a_solve_that_got_stuck_is_reported(monkeypatch: pytest.MonkeyPatch) -> 
 
 
 def test_a_range_beyond_the_voxels_is_refused() -> None:
-    service = _service(max_range_m=200_000.0, fine_m=0.02, tile_size_m=1.0)
+    service = _service(max_range_m=200_000.0, resolution_m=0.02, tile_size_m=1.0)
     points = np.array([[100_000.0, 0, 0], [1.0, 0, 0]], np.float32)
     with pytest.raises(SettingsError, match="max_range_m"):
         service.integrate(Scan(points=points, T_map_sensor=np.eye(4)))
@@ -243,7 +245,8 @@ def test_a_range_beyond_the_voxels_is_refused() -> None:
 
 
 def test_transported_kernels_join_the_map_only_when_asked_to() -> None:
-    plain, carrying = _service(None), _service(None, carry_into_map=True)
+    plain = _service(None)
+    carrying = MappingService(threads=2, make_pipeline=ABLATIONS["RePOT, transported prior"])
     updates = [s.integrate(_scan(0)) for s in (plain, carrying)]
     assert all(len(update.kernels) for update in updates)
     assert updates[0].n_kernels_transported == 0
@@ -261,6 +264,6 @@ def test_priors_are_never_what_a_fit_returned() -> None:
         service.integrate(_scan(k))
     for tile in _tiled(service).tiles.values():
         np.testing.assert_array_equal(tile.kernels.prior_mean, 0.0)
-        np.testing.assert_array_equal(tile.kernels.prior_var, np.float32(service.settings.prior_var))
+        np.testing.assert_array_equal(tile.kernels.prior_var, np.float32(PRIOR_VAR))
         if len(tile.kernels):
-            assert (tile.kernels.kernels.weight_var < service.settings.prior_var).all()
+            assert (tile.kernels.kernels.weight_var < PRIOR_VAR).all()

@@ -8,12 +8,8 @@ import pytest
 from potserver.domain.kernel_map import KernelMap
 from potserver.domain.types import Float64, KernelSet
 from potserver.errors import SolverError
-from potserver.mapping.refinement import (
-    activation,
-    gamma_of_spacing,
-    kernels_at,
-    refine,
-)
+from potserver.mapping.placing import activation, gamma_of_spacing, kernels_at
+from potserver.mapping.refinement import Effort, refine
 from potserver.numerics.beams import LabelledPoints
 from potserver.numerics.geometry import voxel_pick
 from potserver.numerics.warm_fit import WarmFit
@@ -49,12 +45,21 @@ def _placed(labelled: LabelledPoints) -> KernelSet:
     return KernelSet.concatenate([place_kernels(labelled.points, 1.0, 50.0), place_kernels(hits, 0.3, 50.0)])
 
 
-OPTIONS = {"edge_m": 1.0, "feature_cut": 0.01, "newton_steps": 12, "gradient_steps": 40}
+TO_THE_END = Effort(newton_steps=12, gradient_steps=40)
 
 
-def _refine(kernels: KernelSet, labelled: LabelledPoints, **changes: int) -> KernelSet:
-    options = {**OPTIONS, "threads": 1, **changes}
-    return refine(kernels, labelled.points, labelled.occupied, **options).kernels
+def _refine(
+    kernels: KernelSet,
+    labelled: LabelledPoints,
+    *,
+    count: float = 1.0,
+    effort: Effort = TO_THE_END,
+    threads: int = 1,
+) -> KernelSet:
+    counts = np.full(len(labelled.points), count, np.float32)
+    return refine(
+        kernels, labelled.points, labelled.occupied, counts, edge_m=1.0, effort=effort, threads=threads
+    ).kernels
 
 
 @pytest.mark.parametrize("offset", [0.0, -7.3, 4e6])
@@ -133,16 +138,8 @@ def test_a_surer_prior_moves_less() -> None:
 def test_a_point_of_weight_two_is_two_points() -> None:
     labelled = _labelled()
     placed = _placed(labelled)
-    twice = np.concatenate([labelled.points, labelled.points]), np.concatenate([labelled.occupied] * 2)
-    one = refine(
-        placed,
-        labelled.points,
-        labelled.occupied,
-        sample_weight=np.full(600, 2.0, np.float32),
-        threads=1,
-        **OPTIONS,
-    ).kernels
-    other = refine(placed, *twice, threads=1, **OPTIONS).kernels
+    twice = LabelledPoints(*(np.concatenate([column, column]) for column in labelled))
+    one, other = _refine(placed, labelled, count=2.0), _refine(placed, twice)
     np.testing.assert_allclose(one.weight_mean, other.weight_mean, atol=0.02)
 
 
@@ -163,5 +160,5 @@ def test_weights_that_are_not_numbers_are_refused(monkeypatch: pytest.MonkeyPatc
 def test_the_weights_do_not_depend_on_the_number_of_threads() -> None:
     labelled = _labelled()
     placed = _placed(labelled)
-    one, three = (_refine(placed, labelled, newton_steps=3, threads=n) for n in (1, 3))
+    one, three = (_refine(placed, labelled, effort=Effort(3, 40), threads=n) for n in (1, 3))
     np.testing.assert_array_equal(one.weight_mean, three.weight_mean)

@@ -12,7 +12,9 @@ from potserver.domain.dictionary import AtomDictionary
 from potserver.domain.kernel_map import KernelMap
 from potserver.domain.types import KernelSet, MapUpdate, Scan, yaw_pose
 from potserver.errors import EmptyError
-from potserver.mapping.service import MappingService
+from potserver.mapping.carrying import Carrier
+from potserver.mapping.refinement import borrowed_prior, flat_prior
+from potserver.mapping.service import MappingService, method_of
 from potserver.mapping.settings import PROFILES, MappingSettings
 
 ROOM = np.array(
@@ -48,29 +50,28 @@ def _room_scan(
 
 
 def _service(profile: str = "default", dictionary: AtomDictionary | None = None, **changes) -> MappingService:
-    settings = dataclasses.replace(PROFILES[profile], **(FAST | changes))
+    settings = dataclasses.replace(MappingSettings.of_profile(profile), **(FAST | changes))
     return MappingService(dictionary, settings, threads=2)
 
 
-def test_a_new_dictionary_counts_from_the_next_scan_on() -> None:
+def test_a_new_dictionary_counts_from_the_next_scan_on(monkeypatch: pytest.MonkeyPatch) -> None:
     builtin = AtomDictionary.builtin()
     deep = builtin.of_dims(3).atoms
     one, other = AtomDictionary(deep[:1]), AtomDictionary(deep[-1:])
     service = _service(dictionary=one)
     scan = _room_scan()
 
-    class InWork:
-        """Matches as the first dictionary would, and swaps the dictionary in the middle of the scan."""
+    match = Carrier.match
 
-        def __init__(self, matcher) -> None:
-            self._matcher = matcher
+    def swap_and_match(carrier, sectors, *, planar):
+        """In the middle of a scan."""
+        service.use_dictionary(other)
+        return match(carrier, sectors, planar=planar)
 
-        def match(self, sectors):
-            service.use_dictionary(other)
-            return self._matcher.match(sectors)
-
-    service._atoms.matchers[3] = InWork(service._atoms.matchers[3])
-    first, second = service.integrate(scan), service.integrate(_room_scan(x=0.3))
+    with monkeypatch.context() as patched:
+        patched.setattr(Carrier, "match", swap_and_match)
+        first = service.integrate(scan)
+    second = service.integrate(_room_scan(x=0.3))
     assert service.dictionary is other
     assert {match.atom_id for match in first.sectors} - {None} == {deep[0].atom_id}
     assert {match.atom_id for match in second.sectors} - {None} == {deep[-1].atom_id}
@@ -99,7 +100,7 @@ def _same(one: KernelSet, other: KernelSet) -> None:
 def _check_update(update: MapUpdate, service: MappingService) -> None:
     assert update.map_revision == service.snapshot.map_revision
     assert update.map_kernels == len(service.snapshot)
-    assert len(update.sectors) == service.settings.n_sectors
+    assert len(update.sectors) == method_of(service.settings.profile).sectors.n_sectors
     assert np.isfinite(update.kernels.hinge_mean).all()
     for name in ("gamma_shape", "gamma_rate", "weight_var"):
         assert (getattr(update.kernels, name) > 0).all()
@@ -107,7 +108,7 @@ def _check_update(update: MapUpdate, service: MappingService) -> None:
 
 
 @pytest.mark.parametrize("planar", [False, True], ids=["3d", "2d"])
-@pytest.mark.parametrize("profile", list(PROFILES))
+@pytest.mark.parametrize("profile", PROFILES)
 def test_both_profiles_map_a_room(profile: str, planar: bool) -> None:
     service = _service(profile)
     for k in range(3):
@@ -178,7 +179,7 @@ def test_another_seed_draws_other_free_points() -> None:
     )
 
 
-@pytest.mark.parametrize("profile", list(PROFILES))
+@pytest.mark.parametrize("profile", PROFILES)
 def test_a_scan_that_fails_leaves_no_trace(profile: str, monkeypatch: pytest.MonkeyPatch) -> None:
     service, twin = _service(profile), _service(profile)
     for s in (service, twin):
@@ -202,7 +203,7 @@ def test_a_scan_that_fails_leaves_no_trace(profile: str, monkeypatch: pytest.Mon
     _same(service.snapshot.kernels, twin.snapshot.kernels)
 
 
-@pytest.mark.parametrize("profile", list(PROFILES))
+@pytest.mark.parametrize("profile", PROFILES)
 def test_an_old_snapshot_goes_on_answering_the_same(profile: str) -> None:
     service = _service(profile)
     service.integrate(_room_scan(seed=0))
@@ -231,7 +232,7 @@ def test_clear_forgets_and_goes_on_counting() -> None:
 
 
 @pytest.mark.parametrize("height", [0.0, 0.35])
-@pytest.mark.parametrize("profile", list(PROFILES))
+@pytest.mark.parametrize("profile", PROFILES)
 def test_planar_scans_keep_their_kernels_in_their_plane(profile: str, height: float) -> None:
     service = _service(profile)
     for k in range(2):
@@ -240,7 +241,7 @@ def test_planar_scans_keep_their_kernels_in_their_plane(profile: str, height: fl
     np.testing.assert_allclose(service.snapshot.kernels.hinge_mean[:, 2], height, atol=1e-6)
 
 
-@pytest.mark.parametrize("profile", list(PROFILES))
+@pytest.mark.parametrize("profile", PROFILES)
 def test_maps_at_utm_coordinates_are_the_same_maps(profile: str) -> None:
     """A shift by whole tiles, which every grid of kernels divides."""
     shift = (500_010.0, 4_100_010.0, 120.0)
@@ -277,7 +278,7 @@ def test_sectors_without_anything_say_so() -> None:
     _check_update(update, service)
 
 
-@pytest.mark.parametrize("profile", list(PROFILES))
+@pytest.mark.parametrize("profile", PROFILES)
 def test_sectors_without_hits(profile: str) -> None:
     scan = _room_scan()
     service = _service(profile)
@@ -286,7 +287,7 @@ def test_sectors_without_hits(profile: str) -> None:
     _check_update(update, service)
 
 
-@pytest.mark.parametrize("profile", list(PROFILES))
+@pytest.mark.parametrize("profile", PROFILES)
 def test_scans_of_beams_without_return_are_free_space(profile: str) -> None:
     service = _service(profile)
     update = service.integrate(_room_scan(is_return=np.zeros(1200, bool)))
@@ -344,14 +345,11 @@ def test_far_and_near_beams_are_cut_as_the_settings_say() -> None:
 
 
 def test_transported_weights_can_be_left_out_of_the_prior() -> None:
-    """With a prior too narrow for the labels to move it, the weights are the prior's: transported ones, or zero."""
-    scan = _room_scan()
-    without = _service(borrow_weights=False, prior_var=1e-6).integrate(scan).kernels
-    borrowed = _service(borrow_weights=True).integrate(scan).kernels
-    assert len(without) == len(borrowed) > 0
-    np.testing.assert_array_equal(without.hinge_mean, borrowed.hinge_mean)
-    assert np.abs(without.weight_mean).max() < 0.01
-    assert np.abs(borrowed.weight_mean).max() > 1.0
+    kernels = AtomDictionary.builtin().atoms[0].kernels
+    flat = flat_prior(kernels, 7.0)
+    np.testing.assert_array_equal(flat.hinge_mean, kernels.hinge_mean)
+    np.testing.assert_array_equal(flat.weight_mean, 0.0)
+    np.testing.assert_array_equal(flat.weight_var, 7.0)
 
 
 def test_standing_still_does_not_grow_the_default_map() -> None:
@@ -414,10 +412,9 @@ def test_warming_up_leaves_the_map_alone() -> None:
 
 
 def test_what_was_carried_farther_is_trusted_less() -> None:
-    service = _service()
     kernels = AtomDictionary.builtin().atoms[0].kernels
-    near, far = service._prior_of(kernels, 1.0), service._prior_of(kernels, 30.0)
-    per_m2 = service.settings.borrowed_var_per_m2
-    np.testing.assert_allclose(near.weight_var - kernels.weight_var, per_m2, rtol=1e-3)
-    np.testing.assert_allclose(far.weight_var - kernels.weight_var, 30.0 * per_m2, rtol=1e-3)
-    np.testing.assert_array_equal(service._prior_of(kernels, -0.1).weight_var, kernels.weight_var)
+    near, far = borrowed_prior(kernels, 1.0), borrowed_prior(kernels, 30.0)
+    added = near.weight_var - kernels.weight_var
+    assert (added > 1.0).all()
+    np.testing.assert_allclose(far.weight_var - kernels.weight_var, 30.0 * added, rtol=1e-3)
+    np.testing.assert_array_equal(borrowed_prior(kernels, -0.1).weight_var, kernels.weight_var)

@@ -10,8 +10,8 @@ import pytest
 
 from potserver.domain.types import yaw_pose
 from potserver.mapping.matching import Match
-from potserver.mapping.settings import PAPER, MappingSettings
-from potserver.mapping.transport import transport
+from potserver.mapping.paper import PAPER
+from potserver.mapping.transport import CouplingOptions, transport
 from potserver.numerics.displacement import OutOfSample
 from tests.conformance import reference
 
@@ -22,8 +22,8 @@ NONE = np.zeros((0, 3), np.float32)
 ATOM = reference.atom("a", HITS, FREE, reference.kernels_at(np.concatenate([HITS, FREE]), RNG))
 
 
-def _transport(sector, settings=PAPER, atom=ATOM, rotation=0.0):
-    return transport(Match(atom, rotation, 0.0), sector, settings, seed=0)
+def _transport(sector, options=PAPER.coupling, atom=ATOM, rotation=0.0):
+    return transport(Match(atom, rotation, 0.0), sector, options, seed=0)
 
 
 def _wide(hits, free):
@@ -33,10 +33,10 @@ def _wide(hits, free):
 @pytest.mark.parametrize("method", [OutOfSample.NEAREST, OutOfSample.LINEAR])
 def test_a_sector_that_is_the_atom_elsewhere_gets_its_kernels_there(method: OutOfSample) -> None:
     shift = np.float32([3.0, -2.0, 0.5])
-    settings = dataclasses.replace(PAPER, out_of_sample=method)
-    carried = _transport(_wide(HITS + shift, FREE + shift), settings)
+    options = PAPER.coupling._replace(out_of_sample=method)
+    carried = _transport(_wide(HITS + shift, FREE + shift), options)
     assert carried.converged
-    assert carried.marginal_error <= settings.couple_tolerance
+    assert carried.marginal_error <= options.tolerance
     np.testing.assert_allclose(carried.kernels.hinge_mean, ATOM.kernels.hinge_mean + shift, atol=0.05)
 
 
@@ -58,7 +58,7 @@ def test_label_aware_moves_free_space_with_the_free_points() -> None:
     sector = _wide(HITS, FREE + up)
     occupied = ATOM.kernels.weight_mean > 0
     aware = (
-        _transport(sector, dataclasses.replace(PAPER, label_aware=True)).kernels.hinge_mean
+        _transport(sector, PAPER.coupling._replace(is_label_aware=True)).kernels.hinge_mean
         - ATOM.kernels.hinge_mean
     )
     blind = _transport(sector).kernels.hinge_mean - ATOM.kernels.hinge_mean
@@ -69,11 +69,11 @@ def test_label_aware_moves_free_space_with_the_free_points() -> None:
 
 @pytest.mark.parametrize("label_aware", [False, True])
 def test_with_one_label_missing_the_other_carries(label_aware: bool) -> None:
-    settings = dataclasses.replace(PAPER, label_aware=label_aware)
-    without_free = _transport(_wide(HITS, NONE), settings)
+    options = PAPER.coupling._replace(is_label_aware=label_aware)
+    without_free = _transport(_wide(HITS, NONE), options)
     assert without_free.converged
     assert len(without_free.kernels) == len(ATOM.kernels)
-    without_hits = _transport(_wide(NONE, FREE), settings)
+    without_hits = _transport(_wide(NONE, FREE), options)
     assert without_hits.converged
     if label_aware:  # nothing was hit there: the atom's obstacles have no place to go
         free_space = ATOM.kernels.weight_mean[ATOM.kernels.weight_mean <= 0]
@@ -81,7 +81,7 @@ def test_with_one_label_missing_the_other_carries(label_aware: bool) -> None:
     else:
         assert len(without_hits.kernels) == len(ATOM.kernels)
     no_hits = reference.atom("n", NONE, FREE, ATOM.kernels)
-    assert _transport(_wide(HITS, FREE), settings, no_hits).converged
+    assert _transport(_wide(HITS, FREE), options, no_hits).converged
 
 
 def test_nothing_in_common_carries_nothing() -> None:
@@ -92,8 +92,8 @@ def test_nothing_in_common_carries_nothing() -> None:
 
 
 def test_a_coupling_that_failed_carries_nothing() -> None:
-    settings = dataclasses.replace(PAPER, couple_iterations=1, couple_tolerance=1e-9, couple_reg=1e-6)
-    carried = _transport(_wide(HITS * 1.5, FREE), settings)
+    options = PAPER.coupling._replace(max_iterations=1, tolerance=1e-9, reg=1e-6)
+    carried = _transport(_wide(HITS * 1.5, FREE), options)
     assert not carried.converged
     assert carried.marginal_error > 1e-9
     assert len(carried.kernels) == 0
@@ -104,7 +104,7 @@ def test_an_atom_without_kernels_carries_none() -> None:
 
 
 def test_the_default_profile_carries_too() -> None:
-    carried = _transport(reference.sector(HITS, FREE), MappingSettings())
+    carried = _transport(reference.sector(HITS, FREE), CouplingOptions())
     assert carried.converged
     assert 0 < len(carried.kernels) <= len(ATOM.kernels)
 

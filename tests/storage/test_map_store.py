@@ -36,7 +36,7 @@ from potserver.storage.map_store import JOURNAL, TILES, MapStore, MemoryOnly, Re
 
 from .test_tile_codec import assert_same
 
-SETTINGS = MappingSettings(max_range_m=15.0, beams_per_scan=200, match_beams=200)
+SETTINGS = MappingSettings(max_range_m=15.0, beams_per_scan=200)
 DEADLINE_S = 30.0
 
 
@@ -65,7 +65,12 @@ class Map:
         self.folder, self.health = folder, Health()
         self.mapper = MappingService(settings=settings, threads=1)
         self.store = MapStore(
-            folder, "default", keeps_evidence=settings.refine, health=self.health, fsync=False, **options
+            folder,
+            "default",
+            keeps_evidence=self.mapper.keeps_evidence,
+            health=self.health,
+            fsync=False,
+            **options,
         )
         try:
             self.restored: Restored = self.store.restore(self.mapper)

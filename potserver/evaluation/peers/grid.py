@@ -11,7 +11,7 @@ from potclient.results import Bool, Float64
 from potserver.domain.kernel_map import KernelMap
 from potserver.domain.types import KernelSet
 from potserver.evaluation.mappers import Mapper, Size, kernel_bytes
-from potserver.mapping.refinement import kernels_at
+from potserver.mapping.placing import kernels_at
 from potserver.numerics.feature_blocks import feature_blocks
 from potserver.numerics.lattice_nodes import new_nodes
 from potserver.numerics.warm_fit import warm_fit

@@ -1,0 +1,92 @@
+"""How profile `default` maps a scan.
+
+Two things come of it, and neither needs the other. Atoms are carried to the scan: their kernels, refined by its labels, are its
+instantaneous map, which goes back to the sender. And its labels become evidence of the overall map, whose kernels stand on
+lattices; it takes none from atoms.
+"""
+
+from __future__ import annotations
+
+from potserver.domain.map_state import MapState
+from potserver.domain.tiles import TiledMap
+from potserver.domain.types import KernelSet, Scan
+from potserver.mapping.carrying import Carrier
+from potserver.mapping.fusion import Fused, FusionOptions, Look, Moment, fuse, refit, stalest_part
+from potserver.mapping.pipeline import Integrated, LabelledScan, Pipeline, ScanMap, integrated
+from potserver.mapping.refinement import borrowed_prior, instantaneous_map
+from potserver.mapping.sampling import Draws
+from potserver.mapping.stopwatch import Stopwatch
+from potserver.numerics.threads import parallel_pair
+
+
+class DefaultPipeline(Pipeline):
+    """Evidence, lattice kernels and joint solves for the map; refined atoms for the sender."""
+
+    keeps_evidence = True
+
+    def integrate(self, state: MapState, scan: Scan, carrier: Carrier) -> Integrated:
+        clock, draws = Stopwatch(), Draws.of(self.seed, state.n_scans)
+        moment = self.moment(state, scan)
+        with clock("label"):
+            seen = self.label(scan, draws)
+        tiled, source = self.ground(state, seen).with_robot(scan.robot_id)
+        look = Look(seen.labelled, seen.beams.learned, scan.origin, source, scan.is_planar)
+        own, fused = self.learn(tiled, look, seen, moment, carrier, clock)
+        with clock("index"):
+            tiled, fused = self.age(self.indexed(tiled, fused.tiles, self.threads), fused, moment)
+            snapshot = self.snapshot(tiled, moment.revision, state.scores)
+        with clock("check"):
+            scores = self.check(snapshot, seen, state.scores, draws)
+        after = MapState(snapshot=snapshot, tiled=tiled, stamp_ns=moment.stamp_ns, scores=scores)
+        return integrated(state, after, seen, own, fused, clock.timings_ms)
+
+    @property
+    def own_threads(self) -> int:
+        """Half of them: the overall map is worked out at the same time."""
+        return max(1, self.threads // 2)
+
+    # --- the steps, in order ---------------------------------------------------------------------------------------------
+
+    def learn(
+        self,
+        tiled: TiledMap,
+        look: Look,
+        seen: LabelledScan,
+        moment: Moment,
+        carrier: Carrier,
+        clock: Stopwatch,
+    ) -> tuple[ScanMap, Fused]:
+        """The scan's own map and the overall map's new tiles, worked out at the same time."""
+        return parallel_pair(
+            lambda: self.own_map(seen, carrier, tiled.grid.fine_m, clock),
+            lambda: self.fuse(tiled, look, KernelSet.empty(), moment, clock),
+            self.threads,
+        )
+
+    def own_map(self, seen: LabelledScan, carrier: Carrier, resolution_m: float, clock: Stopwatch) -> ScanMap:
+        """The scan's instantaneous map: atoms carried to it, refined by its labels."""
+        carried = self.carry(seen, carrier, clock)
+        prior = KernelSet.concatenate([self.prior_of(t.kernels, m.w2_m2) for m, t in carried.served()])
+        with clock("refine"):
+            refined = instantaneous_map(prior, seen.labelled, resolution_m, threads=self.own_threads)
+        return ScanMap(carried.reports(), prior, refined.kernels, refined.converged)
+
+    def prior_of(self, carried: KernelSet, w2_m2: float) -> KernelSet:
+        """What one sector's carried kernels are worth before the scan's labels."""
+        return borrowed_prior(carried, w2_m2)
+
+    def fuse(
+        self, tiled: TiledMap, look: Look, carried: KernelSet, moment: Moment, clock: Stopwatch
+    ) -> Fused:
+        """The overall map's tiles with the scan in them."""
+        with clock("fuse"):
+            options = FusionOptions.of(self.settings, self.method.effort)
+            return fuse(tiled, look, carried, options, moment, threads=self.threads)
+
+    def age(self, tiled: TiledMap, fused: Fused, moment: Moment) -> tuple[TiledMap, Fused]:
+        """The map with its stalest part fitted again, if evidence ages."""
+        stale = stalest_part(tiled, moment)
+        if stale is None:
+            return tiled, fused
+        aged, _ = refit(tiled, stale, moment, threads=self.threads)
+        return self.indexed(tiled, aged, 1), fused._replace(tiles=fused.tiles | aged)

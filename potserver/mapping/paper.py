@@ -1,0 +1,76 @@
+"""How profile `paper` maps a scan: the authors' published code, as far as it is a choice and not a bug.
+
+Five sectors of 72 degrees, 20 m, coordinates in the map's axes; random subsamples of 200 hits and 50 free points; hits and
+free points scored apart and normalised; eight 45-degree turns of the atom; all kernels moved by the hits' coupling with the
+nearest point's displacement; full-circle crop; plain concatenation.
+
+What differs from their code: one fixed subsample an atom where they draw a new one a candidate, which makes their choice
+random; marginal errors in L1; a failed coupling is solved again with four times the reg, where they add noise; atoms keep at
+most 500 points a label, turned to their bisector; dispersions of position and gamma are carried, where they drop them; points
+without any kernel near are answered as unobserved.
+"""
+
+from __future__ import annotations
+
+from potserver.domain.kernel_map import OBSERVED_ACTIVATION, PRIOR_VAR
+from potserver.domain.map_state import MapState
+from potserver.domain.types import AnswerRule, KernelSet, Scan
+from potserver.mapping.carrying import Carrier
+from potserver.mapping.fusion import Fused, append
+from potserver.mapping.matching import Ranking, RankScore
+from potserver.mapping.pipeline import Integrated, Method, Pipeline, ScanMap, integrated
+from potserver.mapping.sampling import Draws
+from potserver.mapping.sectors import SectorCut
+from potserver.mapping.stopwatch import Stopwatch
+from potserver.mapping.transport import CouplingOptions
+
+_METRES = 50.0  # their coordinates are metres divided by this
+
+PAPER = Method(
+    free_per_beam=2,
+    match_beams=8_000,
+    sectors=SectorCut(n_sectors=5, is_aligned=False),
+    ranking=Ranking(
+        n_hits=200,
+        n_free=50,
+        voxel_m=0.0,
+        reg_m2=0.005 * _METRES**2,
+        tolerance=1e-6,
+        score=RankScore.NORMALISED,
+        rotations_deg=tuple(45.0 * k for k in range(-4, 4)),
+    ),
+    coupling=CouplingOptions(
+        n_points=1500,
+        voxel_m=0.0,
+        reg=0.0005,
+        tolerance=1e-4,
+        is_label_aware=False,
+        stays_in_sector=False,
+    ),
+    rule=AnswerRule(OBSERVED_ACTIVATION, PRIOR_VAR, residual_var=0.0, mean_moderation=1.0),
+    is_calibrated=False,
+)
+
+
+class PotPipeline(Pipeline):
+    """Parameter optimal transport alone: the map is the transported kernels of all scans, as they are."""
+
+    keeps_evidence = False
+
+    def integrate(self, state: MapState, scan: Scan, carrier: Carrier) -> Integrated:
+        clock, draws = Stopwatch(), Draws.of(self.seed, state.n_scans)
+        moment = self.moment(state, scan)
+        with clock("label"):
+            seen = self.label(scan, draws)
+        tiled, _ = self.ground(state, seen).with_robot(scan.robot_id)
+        carried = self.carry(seen, carrier, clock)
+        kernels = KernelSet.concatenate([done.kernels for _, done in carried.served()])
+        own = ScanMap(carried.reports(), kernels, kernels, converged=True)
+        fused = Fused(append(tiled, kernels, moment), len(kernels), len(kernels), True)
+        with clock("index"):
+            tiled = self.indexed(tiled, fused.tiles, self.threads)
+            snapshot = self.snapshot(tiled, moment.revision, state.scores)
+        with clock("check"):
+            scores = self.check(snapshot, seen, state.scores, draws)
+        after = MapState(snapshot=snapshot, tiled=tiled, stamp_ns=moment.stamp_ns, scores=scores)
+        return integrated(state, after, seen, own, fused, clock.timings_ms)

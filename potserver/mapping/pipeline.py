@@ -1,0 +1,198 @@
+"""What the pipelines of all profiles share: the records of their steps, and the steps themselves.
+
+`default.py` and `paper.py` have a pipeline each, with `integrate` as the method on one screen.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from typing import NamedTuple
+
+from potserver.domain.dictionary import AtomDictionary
+from potserver.domain.kernel_map import OBSERVED_ACTIVATION, PRIOR_VAR, KernelMap
+from potserver.domain.map_state import MapState
+from potserver.domain.running_scores import RunningScores
+from potserver.domain.tiles import Tile, TiledMap, TileIndex
+from potserver.domain.types import AnswerRule, KernelSet, MapUpdate, Scan, Sector, SectorMatch, TileChange
+from potserver.mapping.carrying import Carried, Carrier
+from potserver.mapping.checking import check
+from potserver.mapping.fusion import SCAN_EFFORT, FitEffort, Fused, Moment, grid_for
+from potserver.mapping.matching import Ranking
+from potserver.mapping.sampling import BeamLimits, DrawnBeams, Draws, draw_beams, thin_beams
+from potserver.mapping.sectors import SectorCut, cut_sectors
+from potserver.mapping.settings import MappingSettings
+from potserver.mapping.stopwatch import Stopwatch
+from potserver.mapping.transport import CouplingOptions
+from potserver.numerics.beams import LabelledPoints, label_beams
+
+# `mean_moderation` of a twentieth: variances are of single weights, and all of them would make the map timid
+DEFAULT_RULE = AnswerRule(OBSERVED_ACTIVATION, PRIOR_VAR, residual_var=50.0, mean_moderation=0.05)
+
+
+class Method(NamedTuple):
+    """What is tuned and not chosen: a record a step. The defaults are those of profile `default`."""
+
+    free_per_beam: int = 5  # free samples, one in each of so many equal pieces of a beam
+    match_beams: int = 4_000  # beams that are cut into sectors, for transport and the scan's own map
+    sectors: SectorCut = SectorCut()
+    ranking: Ranking = Ranking()
+    coupling: CouplingOptions = CouplingOptions()
+    effort: FitEffort = SCAN_EFFORT
+    rule: AnswerRule = DEFAULT_RULE  # how the map answers until its self-check has points enough
+    is_calibrated: bool = True  # then the self-check chooses the rule's `mean_moderation`
+
+
+class LabelledScan(NamedTuple):
+    """A scan, ready to be learned from."""
+
+    scan: Scan
+    beams: DrawnBeams  # relative to the sensor, map axes
+    labelled: LabelledPoints  # map frame
+    sectors: list[Sector]
+
+
+class ScanMap(NamedTuple):
+    """What atoms say about one scan: its instantaneous map."""
+
+    reports: list[SectorMatch]
+    prior: KernelSet  # as carried, map frame
+    kernels: KernelSet  # refined, where the pipeline refines
+    converged: bool
+
+
+class Integrated(NamedTuple):
+    """What a scan makes of a map."""
+
+    state: MapState
+    update: MapUpdate
+
+
+class Pipeline(ABC):
+    """Integrates scans, one after the other."""
+
+    keeps_evidence: bool  # false: the map keeps kernels alone, and nobody's share of it can be told
+
+    def __init__(
+        self, settings: MappingSettings, method: Method | None = None, *, threads: int, seed: int
+    ) -> None:
+        """Take what all scans have in common.
+
+        Args:
+            settings: Of the map.
+            method: How each step works.
+            threads: Threads of one scan.
+            seed: Of every random choice.
+        """
+        self.settings, self.method = settings, method or Method()
+        self.threads, self.seed = threads, seed
+
+    @abstractmethod
+    def integrate(self, state: MapState, scan: Scan, carrier: Carrier) -> Integrated:
+        """Map a scan. The state is not changed.
+
+        Raises:
+            EmptyError: no beam lies within the range limits.
+            SolverError: a solve ended without numbers.
+            SettingsError: the scan is too wide for the resolution.
+        """
+
+    @property
+    def own_threads(self) -> int:
+        """Threads for what atoms make of a scan."""
+        return self.threads
+
+    def carrier(self, dictionary: AtomDictionary) -> Carrier:
+        """A dictionary, prepared for `integrate`."""
+        method = self.method
+        return Carrier(dictionary, method.ranking, method.coupling, threads=self.own_threads, seed=self.seed)
+
+    def snapshot(self, tiled: TiledMap | None, revision: int, scores: RunningScores) -> KernelMap:
+        """What a map answers from, by what its self-check has found so far."""
+        rule = self.method.rule
+        if self.method.is_calibrated:
+            rule = rule._replace(mean_moderation=scores.moderation(rule.mean_moderation))
+        parts = list(tiled.parts.values()) if tiled is not None else []
+        return KernelMap(parts, **rule._asdict(), map_revision=revision, threads=self.threads)
+
+    # --- the steps of a scan ---------------------------------------------------------------------------------------------
+
+    def label(self, scan: Scan, draws: Draws) -> LabelledScan:
+        """Draw beams, put labelled points on them, and cut those into sectors."""
+        beams = draw_beams(scan, BeamLimits.of(self.settings), draws)
+        labelled = label_beams(
+            beams.learned,
+            free_per_beam=self.method.free_per_beam,
+            gap_m=self.settings.free_gap_m,
+            rng=draws.learn,
+        )
+        drawn = thin_beams(labelled, len(beams.learned.ends), self.method.match_beams, draws)
+        sectors = cut_sectors(drawn, scan.T_map_sensor, self.settings.max_range_m, self.method.sectors)
+        in_map = labelled._replace(points=labelled.points + scan.origin)
+        return LabelledScan(scan, beams, in_map, sectors)
+
+    def moment(self, state: MapState, scan: Scan) -> Moment:
+        """The change that a scan is."""
+        newest_ns = max(state.stamp_ns, scan.stamp_ns)
+        return Moment(state.map_revision + 1, newest_ns, self.settings.half_life_s)
+
+    def ground(self, state: MapState, seen: LabelledScan) -> TiledMap:
+        """The map that a scan is added to; the first scan chooses its grid."""
+        if state.tiled is not None:
+            return state.tiled
+        return TiledMap.empty(
+            grid_for(seen.beams.learned, self.settings.tile_size_m, self.settings.resolution_m)
+        )
+
+    def carry(self, seen: LabelledScan, carrier: Carrier, clock: Stopwatch) -> Carried:
+        """Carry an atom to each sector."""
+        with clock("match"):
+            matches = carrier.match(seen.sectors, planar=seen.scan.is_planar)
+        with clock("transport"):
+            return Carried(seen.sectors, matches, carrier.transport(matches, seen.sectors))
+
+    def check(
+        self, snapshot: KernelMap, seen: LabelledScan, scores: RunningScores, draws: Draws
+    ) -> RunningScores:
+        """Ask the new map about the beams that it did not learn."""
+        return check(snapshot, seen.beams.checked, seen.scan.origin, scores, draws)
+
+    def indexed(self, tiled: TiledMap, tiles: Mapping[TileIndex, Tile], threads: int) -> TiledMap:
+        """The map with some tiles exchanged."""
+        return tiled.with_tiles(tiles, self.method.rule.observed_activation, threads=threads)
+
+
+def integrated(
+    before: MapState,
+    after: MapState,
+    seen: LabelledScan,
+    own: ScanMap,
+    fused: Fused,
+    timings_ms: dict[str, float],
+) -> Integrated:
+    """The new state with the report for the sender.
+
+    Args:
+        before: The state that the scan was added to.
+        after: The state with its snapshot, map and scores.
+        seen: The scan.
+        own: Its instantaneous map.
+        fused: What changed in the overall map.
+        timings_ms: By step.
+    """
+    assert after.tiled is not None, "a scan makes a map"
+    update = MapUpdate(
+        map_revision=after.map_revision,
+        kernels=own.kernels,
+        sectors=own.reports,
+        n_points=len(seen.beams.learned.ends) + len(seen.beams.checked.ends),
+        n_kernels_added=fused.n_added,
+        n_kernels_transported=fused.n_transported,
+        map_kernels=len(after.snapshot),
+        converged=own.converged and fused.converged,
+        rule=after.snapshot.rule,
+        changed=TileChange(after.tiled.grid.size_m, sorted(fused.tiles)),
+        timings_ms=timings_ms,
+    )
+    return Integrated(dataclasses.replace(after, epoch=before.epoch, n_scans=before.n_scans + 1), update)

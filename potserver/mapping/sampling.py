@@ -1,0 +1,83 @@
+"""Which beams of a scan are learned, which are only asked about, and which points of them transport sees."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from potserver.domain.types import Scan
+from potserver.errors import EmptyError
+from potserver.mapping.settings import MappingSettings
+from potserver.numerics.beams import Beams, LabelledPoints, limit_range
+
+_MOST_CHECKED = 100  # beams a scan, about
+
+
+class BeamLimits(NamedTuple):
+    """What of a scan is used; the settings of the same names say more."""
+
+    min_range_m: float
+    max_range_m: float
+    beams_per_scan: int
+    check_share: float
+
+    @staticmethod
+    def of(settings: MappingSettings) -> BeamLimits:
+        """What drawing beams needs of the settings."""
+        return BeamLimits(
+            settings.min_range_m, settings.max_range_m, settings.beams_per_scan, settings.check_share
+        )
+
+
+class Draws(NamedTuple):
+    """The random choices of one scan. What is checked has a generator of its own: checking changes nothing else."""
+
+    learn: np.random.Generator
+    check: np.random.Generator
+
+    @staticmethod
+    def of(seed: int, n_scans: int) -> Draws:
+        """Those of the scan that comes after `n_scans` others."""
+        return Draws(np.random.default_rng((seed, n_scans)), np.random.default_rng((seed, n_scans, 1)))
+
+
+class DrawnBeams(NamedTuple):
+    """A scan's beams, limited in range and number; the sensor is the origin, the axes are the map's."""
+
+    learned: Beams
+    checked: Beams  # never learned, only asked about
+
+
+def draw_beams(scan: Scan, limits: BeamLimits, draws: Draws) -> DrawnBeams:
+    """Limit a scan's beams, and keep some of them for the self-check.
+
+    Raises:
+        EmptyError: no beam is long enough.
+    """
+    beams = limit_range(scan.beams, limits.min_range_m, limits.max_range_m)
+    n = len(beams.ends)
+    if n == 0:
+        raise EmptyError(
+            f"none of {len(scan.points)} beams is longer than {limits.min_range_m} m: nothing to learn from"
+        )
+    drawn = np.arange(n)
+    if n > limits.beams_per_scan:
+        drawn = np.sort(draws.learn.choice(n, limits.beams_per_scan, replace=False))
+    is_checked = draws.check.random(len(drawn)) < min(limits.check_share, _MOST_CHECKED / len(drawn))
+    is_checked[0] &= not is_checked.all()  # something must be learned
+    learned, checked = drawn[~is_checked], drawn[is_checked]
+    return DrawnBeams(
+        Beams(beams.ends[learned], beams.is_return[learned]),
+        Beams(beams.ends[checked], beams.is_return[checked]),
+    )
+
+
+def thin_beams(labelled: LabelledPoints, n_beams: int, limit: int, draws: Draws) -> LabelledPoints:
+    """The points of at most `limit` of the `n_beams` beams."""
+    if n_beams <= limit:
+        return labelled
+    drawn = np.zeros(n_beams, bool)
+    drawn[draws.learn.choice(n_beams, limit, replace=False)] = True
+    members = drawn[labelled.beam]
+    return LabelledPoints(labelled.points[members], labelled.occupied[members], labelled.beam[members])
