@@ -266,15 +266,14 @@ def _draw_atoms(dictionary: AtomDictionary, options: argparse.Namespace, *, titl
 
 
 def _atoms_export(options: argparse.Namespace) -> int:
+    from potschemas.answers import AnswerRule
     from potserver.adapters import codec
     from potserver.domain.dictionary import AtomDictionary
-    from potserver.domain.types import AnswerRule
 
     settings = _settings(options)
     dictionary = AtomDictionary.load(settings.dictionary) if settings.dictionary else AtomDictionary.builtin()
     atoms = [dictionary.get(atom_id) for atom_id in options.atom_id] or list(dictionary)
-    m = settings.mapping
-    rule = AnswerRule(m.observed_activation, m.prior_var, m.residual_var, m.mean_moderation)
+    rule = AnswerRule.of(settings.mapping)
     folder = Path(options.out)
     try:
         folder.mkdir(parents=True, exist_ok=True)

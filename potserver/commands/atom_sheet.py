@@ -15,6 +15,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import FormatStrFormatter, LogLocator, NullLocator
 from numpy.typing import NDArray
 
+from potschemas.answers import AnswerRule
 from potserver.domain.dictionary import AtomDictionary
 from potserver.domain.kernel_map import KernelMap
 from potserver.domain.types import Atom, Float64, KernelSet
@@ -289,15 +290,7 @@ def _draw_prediction(mean: Any, std: Any, atom: Atom, view: _View, palette: _Pal
     )
     points = np.full((right.size, 3), view.level_m)
     points[:, view.right], points[:, view.up] = right.ravel(), up.ravel()
-    s = MappingSettings()
-    answer = KernelMap(
-        atom.kernels,
-        observed_activation=s.observed_activation,
-        prior_var=s.prior_var,
-        residual_var=s.residual_var,
-        mean_moderation=s.mean_moderation,
-        threads=1,
-    ).occupancy(points)
+    answer = KernelMap(atom.kernels, rule=AnswerRule.of(MappingSettings()), threads=1).occupancy(points)
     extent = (
         view.lower[0], view.lower[0] + n_right * cell, view.lower[1], view.lower[1] + n_up * cell
     )  # fmt: skip

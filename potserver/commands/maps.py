@@ -143,9 +143,7 @@ class UnservedMap:
         self._record = saved.record
         self._parts = [] if saved.tiled is None else [part.kernels for part in saved.tiled.parts.values()]
         indexed = [] if saved.tiled is None else list(saved.tiled.parts.values())
-        self._map = KernelMap(
-            indexed, **saved.record.answer_rule._asdict(), map_revision=saved.record.revision
-        )
+        self._map = KernelMap(indexed, rule=saved.record.answer_rule, map_revision=saved.record.revision)
 
     def info(self) -> messages.Info:
         """What the map is."""
@@ -247,7 +245,7 @@ def _with_rule(saved: SavedMap) -> MapState:
     """The state whose snapshot answers as the saved one did."""
     parts = [] if saved.tiled is None else list(saved.tiled.parts.values())
     state = saved.state()
-    snapshot = KernelMap(parts, **saved.record.answer_rule._asdict(), map_revision=saved.record.revision)
+    snapshot = KernelMap(parts, rule=saved.record.answer_rule, map_revision=saved.record.revision)
     return dataclasses.replace(state, snapshot=snapshot)
 
 
@@ -310,13 +308,7 @@ def places_of(leaves: Leaves, resolution: float, fine_m: float, looks: float = 1
 
 def _from_kernels(path: Path, settings: Settings) -> MapState:
     kernels = _read(lambda: ClientKernels.load(path), path)
-    rule = {
-        "observed_activation": kernels.observed_activation,
-        "prior_var": kernels.prior_var,
-        "residual_var": kernels.residual_var,
-        "mean_moderation": kernels.mean_moderation,
-    }
-    mapping = dataclasses.replace(settings.mapping, refine=False, calibrate=False, **rule)
+    mapping = dataclasses.replace(settings.mapping, refine=False, calibrate=False, **kernels.rule.fields())
     service = MappingService(AtomDictionary(()), mapping, threads=settings.threads)
     arrays = {f.name: getattr(kernels, f.name) for f in dataclasses.fields(KernelSet)}
     return state_of_kernels(service, KernelSet(**arrays))

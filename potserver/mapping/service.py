@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from potschemas.answers import AnswerRule
 from potserver.domain.dictionary import AtomDictionary
 from potserver.domain.kernel_map import KernelMap
 from potserver.domain.map_state import MapState
@@ -427,10 +428,11 @@ class MappingService:
         if s.calibrate and scores is not None:
             moderation = scores.moderation(moderation)
         return KernelMap(
-            list(tiled.parts.values()) if tiled is not None else [], observed_activation=s.observed_activation,
-            prior_var=s.prior_var, residual_var=s.residual_var, mean_moderation=moderation, map_revision=revision,
+            list(tiled.parts.values()) if tiled is not None else [],
+            rule=dataclasses.replace(AnswerRule.of(s), mean_moderation=moderation),
+            map_revision=revision,
             threads=self._threads,
-        )  # fmt: skip
+        )
 
 
 class _FromAtoms(NamedTuple):

@@ -6,7 +6,7 @@ import dataclasses
 import math
 from enum import Enum
 
-from potserver.domain.kernel_map import OBSERVED_ACTIVATION, PRIOR_VAR
+from potschemas.answers import OBSERVED_ACTIVATION, PRIOR_VAR
 from potserver.errors import SettingsError
 from potserver.numerics.displacement import OutOfSample
 

@@ -8,6 +8,7 @@ map      one row: everything else (`MapRecord`) as JSON, and its digest; it coun
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import sqlite3
 import time
 from collections.abc import Iterable, Mapping
@@ -19,12 +20,13 @@ import msgspec
 import numpy as np
 
 from potschemas import __version__
+from potschemas.answers import AnswerRule
 from potserver.domain.folders import sync_folder
 from potserver.domain.kernel_map import KernelMap
 from potserver.domain.map_state import MapState
 from potserver.domain.running_scores import RunningScores
 from potserver.domain.tiles import Tile, TiledMap, TileGrid, TileIndex
-from potserver.domain.types import AnswerRule, KernelSet
+from potserver.domain.types import KernelSet
 from potserver.errors import MapFileError, StorageError
 from potserver.storage.sqlite import Kind, after_damage, connect, connect_read_only, reading, transaction
 from potserver.storage.tile_codec import DIGEST_BYTES, decode_tile, digest_of, encode_tile
@@ -64,6 +66,9 @@ class MapRecord(msgspec.Struct, frozen=True, kw_only=True):
     scores_bins: list[list[float]]
     n_tiles: int
     tiles_digest: str  # sum of the tiles' digests, hexadecimal
+
+    def __post_init__(self) -> None:
+        AnswerRule(*self.rule)  # raises ValueError where it is none
 
     @property
     def answer_rule(self) -> AnswerRule:
@@ -263,7 +268,7 @@ def _record_of(state: MapState, origin: Origin, tiles: Mapping[TileIndex, tuple[
         robots=[] if tiled is None else list(tiled.robots),
         stamps=dict(origin.stamps),
         keeps_evidence=origin.keeps_evidence,
-        rule=(rule.observed_activation, rule.prior_var, rule.residual_var, rule.mean_moderation),
+        rule=dataclasses.astuple(rule),
         scores_n=scores.n_points,
         scores_nll=scores.nll.tolist(),
         scores_brier=scores.brier,
