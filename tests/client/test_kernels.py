@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 from hypothesis import given
@@ -168,12 +170,29 @@ def test_a_message_keeps_precision_far_from_the_origin() -> None:
 
 
 def test_a_message_with_arrays_that_disagree_is_a_bad_reply() -> None:
-    import msgspec
-
     message = msgspec.structs.replace(kernels().to_message(), weight_var=encode_array(np.ones(3, np.float32)))
     assert isinstance(message, messages.Kernels)
     with pytest.raises(BadReplyError, match="weight_var"):
         KernelSet.from_message(message)
+
+
+def test_a_message_with_a_rule_that_is_none_is_a_bad_reply() -> None:
+    message = msgspec.structs.replace(kernels().to_message(), prior_var=-1.0)
+    with pytest.raises(BadReplyError, match="prior_var"):
+        KernelSet.from_message(message)
+
+
+def test_files_without_a_moderation_have_the_full_share(tmp_path: Path) -> None:
+    kernels().save(tmp_path / "k.npz")
+    with np.load(tmp_path / "k.npz") as stored:
+        arrays = {name: stored[name] for name in stored if name != "mean_moderation"}
+    np.savez(tmp_path / "early.npz", **arrays)
+    early = KernelSet.load(tmp_path / "early.npz")
+    assert early.rule == dataclasses.replace(kernels().rule, mean_moderation=1.0)
+    del arrays["prior_var"]
+    np.savez(tmp_path / "none.npz", **arrays)
+    with pytest.raises(UsageError, match="prior_var"):
+        KernelSet.load(tmp_path / "none.npz")
 
 
 def test_sets_of_one_map_join_and_sets_of_two_do_not() -> None:

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import re
 import subprocess
 import sys
+from pathlib import Path
+from types import CodeType, SimpleNamespace
 from typing import Any
 
 import msgspec
@@ -156,6 +159,61 @@ def test_the_compiled_copy_in_the_rays_is_the_same_answer(rule: AnswerRule) -> N
     got = answer(sums, rule)
     z = [rays.moderated(*at, rule.residual_var, rule.mean_moderation) for at in zip(*sums, strict=True)]
     np.testing.assert_allclose(sigmoid(np.array(z))[got.observed], got.mean[got.observed], rtol=1e-12)
+
+
+# --- the formulas of the contract --------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def formulas(root: Path) -> CodeType:
+    """The Python of the README's section, to be run as it stands."""
+    section = (root / "schemas" / "README.md").read_text().partition("### From kernels to answers\n")[2]
+    blocks = re.findall(r"^```python\n(.*?)^```", section.partition("\n### ")[0], re.MULTILINE | re.DOTALL)
+    assert len(blocks) == 2
+    return compile("\n".join(blocks), "schemas/README.md", "exec")
+
+
+@pytest.mark.parametrize("rule", RULES)
+def test_the_formulas_of_the_contract_are_the_answers(formulas: CodeType, rule: AnswerRule) -> None:
+    rng, k, n = np.random.default_rng(5), 60, 250
+    kernels = {
+        "origin": np.array([400.0, -300.0, 2.0]),
+        "hinge_mean": rng.uniform(-3, 3, (k, 3)),
+        "gamma_shape": rng.uniform(1, 4, k),
+        "gamma_rate": rng.uniform(1, 4, k),
+        "weight_mean": rng.normal(0, 4, k),
+        "weight_var": rng.uniform(0.1, 9, k),
+    }
+    points = kernels["origin"] + rng.uniform(-4, 4, (n, 3))
+
+    def told(x: Array) -> SimpleNamespace:
+        names = {**kernels, **rule.fields(), "x": x}
+        exec(formulas, names)
+        return SimpleNamespace(**names)
+
+    at = [told(x) for x in points]
+    a, grad_a = np.stack([t.a for t in at]), np.stack([t.grad_a for t in at])
+    w, v = kernels["weight_mean"], kernels["weight_var"]
+    sums = LatentSums(a @ w, a**2 @ v, a.sum(axis=1))
+    slopes = LatentGradients(
+        np.einsum("k,nkd->nd", w, grad_a), np.einsum("nk,nkd->nd", 2 * v * a, grad_a), grad_a.sum(axis=1)
+    )
+    got, of_got = answer(sums, rule), gradients(sums, slopes, rule)
+    near_edge = np.abs(sums.activation[:, None] - [rule.observed_activation, 1.0]).min(axis=1) < 1e-4
+    if rule.observed_activation > 0:
+        assert (~got.observed).sum() > 5
+    assert (got.observed & (sums.activation < 1)).sum() > 50
+    assert (sums.activation > 1).sum() > 50
+    for name, values in got._asdict().items():
+        np.testing.assert_allclose([getattr(t, name) for t in at], values, rtol=1e-12)
+    np.testing.assert_allclose([t.gradient for t in at], of_got.mean, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose([t.latent_gradient for t in at], of_got.latent_mean, rtol=1e-9, atol=1e-12)
+    for axis in range(3):
+        step = 1e-6 * np.eye(3)[axis]
+        for name, slope in (("mean", of_got.mean), ("latent_mean", of_got.latent_mean)):
+            ahead, behind = (np.array([getattr(told(x + s), name) for x in points]) for s in (step, -step))
+            difference = (ahead - behind) / 2e-6
+            np.testing.assert_allclose(slope[~near_edge, axis], difference[~near_edge], rtol=1e-5, atol=1e-6)
 
 
 # --- the rule in messages ---------------------------------------------------------------------------------------------
