@@ -290,7 +290,6 @@ def _atoms_import(options: argparse.Namespace) -> int:
     from potserver.atoms.admission import AdmissionSettings, admit
     from potserver.domain.dictionary import AtomDictionary
 
-    settings = _settings(options)
     out = Path(options.out)
     dictionary = AtomDictionary.load(out) if out.exists() else AtomDictionary()
     for name in options.file:

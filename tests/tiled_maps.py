@@ -8,6 +8,7 @@ import numpy as np
 
 from potclient.mirror import Ask
 from potschemas import messages, wire
+from potschemas.answers import AnswerRule
 from potserver.adapters import codec
 from potserver.asking.tiles import plan_tiles
 from potserver.domain.kernel_map import KernelMap
@@ -61,8 +62,7 @@ def tiled_state(
     moved = [kernels.moved(np.array(index) * GRID.size_m) for index, (kernels, _) in tiles.items()]
     snapshot = KernelMap(
         KernelSet.concatenate(moved),
-        residual_var=20.0,
-        mean_moderation=0.05,
+        rule=AnswerRule(residual_var=20.0, mean_moderation=0.05),
         map_revision=revision,
         threads=1,
     )

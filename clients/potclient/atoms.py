@@ -25,9 +25,7 @@ class Atom:
     info: messages.AtomInfo
     hit_points: Float32  # (H, 3) m, atom frame
     free_points: Float32  # (F, 3) m, atom frame
-    kernels: (
-        KernelSet  # atom frame; its three scalars belong to the map that was asked, and do not travel back
-    )
+    kernels: KernelSet  # atom frame; their rule is that of the map that was asked, and servers ignore it
 
     @staticmethod
     def create(

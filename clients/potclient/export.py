@@ -113,29 +113,27 @@ def export_ply(
 ) -> Exported:
     """Kernels as a binary PLY: a vertex each, with all ten numbers, red where its weight says occupied and blue where free.
 
-    The header's comments have the scalars that turn kernels into answers. Vertices come in no special order.
+    The header's comments have the rule that turns kernels into answers. Vertices come in no special order.
 
     Raises:
         PotclientError: see `MapClient.params_parts`; nothing is written then.
     """
     n, revisions, done = 0, set(), 0
-    scalars = ""
+    rule = ""
     with whole(path) as file:
         file.write(b" " * _PLY_HEADER_BYTES)  # how many there are is known at the end
         for _, n_parts, kernels in source.params_parts(lower, upper):
             file.write(_ply_rows(kernels).tobytes())
             n += len(kernels)
             revisions.add(kernels.map_revision)
-            scalars = (
-                f"comment observed_activation {kernels.observed_activation:.9g}\ncomment prior_var {kernels.prior_var:.9g}\n"
-                f"comment residual_var {kernels.residual_var:.9g}\ncomment map_revision {kernels.map_revision}\n"
-            )
+            rule = "".join(f"comment {name} {value:.9g}\n" for name, value in kernels.rule.fields().items())
+            rule += f"comment map_revision {kernels.map_revision}\n"
             done += 1
             if progress is not None:
                 progress(done, n_parts)
         head = (
             "ply\nformat binary_little_endian 1.0\ncomment kernels of a potserver map, metres, map frame\n"
-            + scalars
+            + rule
         )
         tail = f"element vertex {n}\n" + "".join(f"property {kind} {name}\n" for name, _, kind in _PLY_FIELDS)
         filling = _PLY_HEADER_BYTES - len(head) - len(tail) - len("comment \nend_header\n")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 import os
 import zipfile
 from collections.abc import Iterable, Iterator
@@ -16,8 +15,10 @@ from numpy.typing import ArrayLike, NDArray
 from potclient.errors import BadReplyError, UsageError
 from potclient.files import save_npz
 from potclient.results import Bool, Float32, Float64, Occupancy, as_points
+from potschemas import answers
+from potschemas.answers import RULE_FIELDS, AnswerRule, LatentGradients, LatentSums
 from potschemas.messages import Array, DType, Kernels
-from potschemas.wire import WireError, decode_array, encode_array
+from potschemas.wire import decode_array, encode_array
 
 _FILE_VERSION = 1
 _BLOCK_ELEMENTS = 2**20  # entries of one block of the (points, kernels) matrix: 8 MiB a temporary
@@ -27,7 +28,7 @@ _MAX_EXPONENT = 44.0  # exp(-44) is 8e-20: nothing beside weights and their sums
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class KernelSet:
-    """K kernels in one frame (the map's, unless they are an atom's), and the scalars that turn them into answers.
+    """K kernels in one frame (the map's, unless they are an atom's), and the rule that turns them into answers.
 
     f(x) = sum_m w_m exp(-gamma_m |x - h_m|^2); h, gamma and w are distributions, ten numbers a kernel in all.
     """
@@ -38,10 +39,7 @@ class KernelSet:
     gamma_rate: Float32  # (K,) m^2, > 0; E[gamma] = shape / rate
     weight_mean: Float32  # (K,) log-odds
     weight_var: Float32  # (K,) log-odds^2
-    observed_activation: float  # summed activation below which a point counts as unobserved
-    prior_var: float  # log-odds^2, the latent variance of an unobserved point
-    residual_var: float  # log-odds^2, added in the measure that the summed activation falls short of 1
-    mean_moderation: float = 1.0  # share of the latent variance that pulls the mean towards 0.5
+    rule: AnswerRule
     map_revision: int = 0
 
     def __post_init__(self) -> None:
@@ -70,86 +68,67 @@ class KernelSet:
         return dataclasses.replace(self, **arrays)
 
     def occupancy(self, points: ArrayLike, *, gradient: bool = False) -> Occupancy:
-        """What these kernels say at points: the formulas of the server, in float64.
+        """What these kernels say at points, summed in float64, by the server's own formulas (`potschemas.answers`).
 
-        With mu = f(x) and s2 = sum_m var_m phi_m^2 + residual_var max(0, 1 - sum_m phi_m):
-        mean = sigmoid(mu / sqrt(1 + c pi s2 / 8)), c = `mean_moderation`, and
-        var = mean (1 - mean) (1 - 1 / sqrt(1 + pi s2 / 8)). Where the summed
-        activation stays below `observed_activation` the answer is 0.5, latent mean 0 and latent variance `prior_var`, and
-        `observed` is false. Kernels with an activation under 1e-19 are left out;
-        memory is bounded whatever N and K are.
+        Kernels with an activation below 1e-19 are left out. Memory is bounded whatever N and K are.
 
         Args:
             points: (N, 3), or (N, 2) with z = 0; m, the kernels' frame.
             gradient: Give the analytic gradients of the mean and of the latent mean too; both are 0 where unobserved.
         Raises:
             UsageError: wrong shape, or coordinates that are not finite.
-        Source: mean, MacKay 1992; variance, Daunizeau 2017 (semi-analytical moments of the logistic-normal).
         """
         queries = as_points(points)
-        n, k = len(queries), len(self)
-        latent_mean, latent_var, activation = np.zeros(n), np.zeros(n), np.zeros(n)
-        mean_slope, var_slope, activation_slope = np.zeros((3, n, 3))
-        if n and k:
-            # Distances are taken about a local origin: |x|^2 + |h|^2 - 2 x.h loses centimetres at UTM coordinates.
-            origin = self.hinge_mean.mean(axis=0)
-            hinges = self.hinge_mean - origin
-            gamma = self.gamma_shape.astype(np.float64) / self.gamma_rate.astype(np.float64)
-            weights = np.stack([np.ones(k), self.weight_mean.astype(np.float64)], axis=1)
-            weight_var = self.weight_var.astype(np.float64)
-            for rows, x, near in _neighbourhoods(queries - origin, hinges, gamma):
-                step = max(1, _BLOCK_ELEMENTS // len(rows))
-                for first in range(0, len(near), step):
-                    columns = near[first : first + step]
-                    phi = _activations(x, hinges[columns], gamma[columns])
-                    sums = phi @ weights[columns]
-                    activation[rows] += sums[:, 0]
-                    latent_mean[rows] += sums[:, 1]
-                    if gradient:
-                        h, g = hinges[columns], gamma[columns]
-                        mean_slope[rows] += _slopes(phi, x, h, -2.0 * g * weights[columns, 1])
-                        activation_slope[rows] += _slopes(phi, x, h, -2.0 * g)
-                    np.square(phi, out=phi)
-                    latent_var[rows] += phi @ weight_var[columns]
-                    if gradient:
-                        var_slope[rows] += _slopes(phi, x, h, -4.0 * g * weight_var[columns])
-        observed = activation >= self.observed_activation if k else np.zeros(n, np.bool_)
-        latent_var += self.residual_var * np.maximum(1.0 - activation, 0.0)
-        # the residual variance falls only where it is there: below an activation of 1
-        var_slope -= np.where(activation < 1.0, self.residual_var, 0.0)[:, None] * activation_slope
-        latent_mean[~observed] = 0.0
-        latent_var[~observed] = self.prior_var
-        scale = 1.0 / np.sqrt(1.0 + (math.pi / 8.0) * latent_var)
-        pull = 1.0 / np.sqrt(1.0 + (self.mean_moderation * math.pi / 8.0) * latent_var)
-        mean = _sigmoid(latent_mean * pull)
-        slopes: dict[str, Float32] = {}
-        if gradient:
-            by_var = (self.mean_moderation * math.pi / 16.0) * latent_mean * pull**3
-            mean_gradient = (mean * (1.0 - mean))[:, None] * (
-                pull[:, None] * mean_slope - by_var[:, None] * var_slope
-            )
-            for name, slope in (("gradient", mean_gradient), ("latent_gradient", mean_slope)):
-                slopes[name] = np.where(observed[:, None], slope, 0.0).astype(np.float32)
+        sums, slopes = self._sums(queries, gradient=gradient)
+        told = answers.answer(sums, self.rule)._asdict()
+        if slopes is not None:
+            of_answer = answers.gradients(sums, slopes, self.rule)
+            told |= {"gradient": of_answer.mean, "latent_gradient": of_answer.latent_mean}
+        observed = told.pop("observed")
         return Occupancy(
-            mean=mean.astype(np.float32),
-            var=(mean * (1.0 - mean) * (1.0 - scale)).astype(np.float32),
-            latent_mean=latent_mean.astype(np.float32),
-            latent_var=latent_var.astype(np.float32),
+            **{name: values.astype(np.float32) for name, values in told.items()},
             observed=observed,
             revisions=(self.map_revision,),
-            **slopes,
         )
+
+    def _sums(self, points: Float64, *, gradient: bool) -> tuple[LatentSums, LatentGradients | None]:
+        """The sums over all kernels at (N, 3) points, and their gradients if asked for; float64."""
+        n, k = len(points), len(self)
+        sums = LatentSums(*np.zeros((3, n)))
+        slopes = LatentGradients(*np.zeros((3, n, 3))) if gradient else None
+        if n == 0 or k == 0:
+            return sums, slopes
+        # Distances are taken about a local origin: |x|^2 + |h|^2 - 2 x.h loses centimetres at UTM coordinates.
+        origin = self.hinge_mean.mean(axis=0)
+        hinges = self.hinge_mean - origin
+        gamma = self.gamma_shape.astype(np.float64) / self.gamma_rate.astype(np.float64)
+        weights = np.stack([self.weight_mean.astype(np.float64), np.ones(k)], axis=1)
+        weight_var = self.weight_var.astype(np.float64)
+        for rows, x, near in _neighbourhoods(points - origin, hinges, gamma):
+            step = max(1, _BLOCK_ELEMENTS // len(rows))
+            for first in range(0, len(near), step):
+                columns = near[first : first + step]
+                h, g, w, v = hinges[columns], gamma[columns], weights[columns], weight_var[columns]
+                phi = _activations(x, h, g)
+                mean, activation = (phi @ w).T
+                sums.mean[rows] += mean
+                sums.activation[rows] += activation
+                if slopes is not None:
+                    slopes.mean[rows] += _slopes(phi, x, h, -2.0 * g * w[:, 0])
+                    slopes.activation[rows] += _slopes(phi, x, h, -2.0 * g)
+                np.square(phi, out=phi)
+                sums.var[rows] += phi @ v
+                if slopes is not None:
+                    slopes.var[rows] += _slopes(phi, x, h, -4.0 * g * v)
+        return sums, slopes
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write an .npz (no pickle), whole or not at all; the name is taken as given."""
         save_npz(
             path,
             potclient_kernels=np.int64(_FILE_VERSION),
-            observed_activation=np.float64(self.observed_activation),
-            prior_var=np.float64(self.prior_var),
-            residual_var=np.float64(self.residual_var),
-            mean_moderation=np.float64(self.mean_moderation),
             map_revision=np.int64(self.map_revision),
+            **{name: np.float64(value) for name, value in self.rule.fields().items()},
             **{name: getattr(self, name) for name in _SHAPES},
         )
 
@@ -168,11 +147,10 @@ class KernelSet:
                         f"{path}: kernel file of version {version}, this client reads {_FILE_VERSION}"
                     )
                 return cls(
-                    observed_activation=float(stored["observed_activation"]),
-                    prior_var=float(stored["prior_var"]),
-                    residual_var=float(stored["residual_var"]),
-                    # files of before it was a choice have the full share
-                    mean_moderation=float(stored["mean_moderation"]) if "mean_moderation" in stored else 1.0,
+                    # early files have no `mean_moderation`: its default is theirs
+                    rule=AnswerRule(
+                        **{n: stored[n] for n in RULE_FIELDS if n != "mean_moderation" or n in stored}
+                    ),
                     map_revision=int(stored["map_revision"]),
                     **{
                         name: stored[name].astype(np.float64 if name == "hinge_mean" else np.float32)
@@ -193,10 +171,7 @@ class KernelSet:
             gamma_rate=encode_array(self.gamma_rate.astype(np.float32)),
             weight_mean=encode_array(self.weight_mean.astype(np.float32)),
             weight_var=encode_array(self.weight_var.astype(np.float32)),
-            observed_activation=self.observed_activation,
-            prior_var=self.prior_var,
-            residual_var=self.residual_var,
-            mean_moderation=self.mean_moderation,
+            **self.rule.fields(),
         )
 
     @classmethod
@@ -204,7 +179,7 @@ class KernelSet:
         """The kernels of a message.
 
         Raises:
-            BadReplyError: an array of the message has the wrong dtype, shape or byte count.
+            BadReplyError: an array has the wrong dtype, shape or byte count, or the rule a number that is negative.
         """
 
         def array(name: str, wire: Array, shape: tuple[int | None, ...]) -> Float32:
@@ -220,13 +195,10 @@ class KernelSet:
                 gamma_rate=array("gamma_rate", message.gamma_rate, (k,)),
                 weight_mean=array("weight_mean", message.weight_mean, (k,)),
                 weight_var=array("weight_var", message.weight_var, (k,)),
-                observed_activation=message.observed_activation,
-                prior_var=message.prior_var,
-                residual_var=message.residual_var,
-                mean_moderation=message.mean_moderation,
+                rule=AnswerRule.of(message),
                 map_revision=map_revision,
             )
-        except WireError as error:
+        except ValueError as error:  # a WireError is one
             raise BadReplyError(f"kernels: {error}") from error
 
     @staticmethod
@@ -234,17 +206,14 @@ class KernelSet:
         """One set of all kernels, in order.
 
         Raises:
-            UsageError: no sets, or sets that disagree on the scalars or the revision.
+            UsageError: no sets, or sets that disagree on the rule or the revision.
         """
         parts = list(sets)
         if not parts:
             raise UsageError("no kernel sets to join")
-        scalars = {
-            (p.observed_activation, p.prior_var, p.residual_var, p.mean_moderation, p.map_revision)
-            for p in parts
-        }
-        if len(scalars) > 1:
-            raise UsageError(f"kernel sets of different maps or revisions: {sorted(scalars)}")
+        origins = list(dict.fromkeys((p.map_revision, p.rule) for p in parts))
+        if len(origins) > 1:
+            raise UsageError(f"kernel sets of different maps or revisions: {origins}")
         arrays: dict[str, Any] = {name: np.concatenate([getattr(p, name) for p in parts]) for name in _SHAPES}
         return dataclasses.replace(parts[0], **arrays)
 
@@ -302,9 +271,3 @@ def _activations(x: Float64, hinges: Float64, gamma: Float64) -> Float64:
 def _slopes(phi: Float64, x: Float64, hinges: Float64, factor: Float64) -> Float64:
     """(N, 3): sum_m factor_m phi_m (x - h_m)."""
     return x * (phi @ factor)[:, None] - phi @ (factor[:, None] * hinges)
-
-
-def _sigmoid(x: Float64) -> Float64:
-    """1 / (1 + exp(-x)) without overflow."""
-    e = np.exp(-np.abs(x))
-    return np.where(x >= 0, 1.0 / (1.0 + e), e / (1.0 + e))

@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from potclient.errors import BadReplyError, IncompleteReplyError, UsageError
 from potclient.kernels import KernelSet
 from potclient.results import Bool, Float32, Float64, Occupancy
+from potschemas.answers import RULE_FIELDS, AnswerRule
 from potschemas.messages import MAX_PART_KERNELS, CodedKernels, DType, Packed, TilesPart, TilesQuery
 from potschemas.wire import WireError, pack_array, unpack_array
 
@@ -22,8 +23,7 @@ Int64 = NDArray[np.int64]
 TileIndex = tuple[int, int, int]  # floor(p_map / tile_size_m)
 Ask = Callable[[TilesQuery], Iterator[tuple[TilesPart, int]]]  # the parts of the reply, with their bytes
 
-_SCALARS = ("observed_activation", "prior_var", "residual_var", "mean_moderation")
-_SAME_IN_ALL_PARTS = ("n_parts", "epoch", "map_revision", "whole", "tile_size_m", *_SCALARS)
+_SAME_IN_ALL_PARTS = ("n_parts", "epoch", "map_revision", "whole", "tile_size_m", *RULE_FIELDS)
 _CELLS = (DType.UINT8, DType.INT64)
 
 
@@ -139,7 +139,7 @@ class _State:
 
     epoch: int
     revision: int
-    scalars: dict[str, Any]  # float each; what turns sums over kernels into answers
+    rule: AnswerRule
     tiles: Mapping[TileIndex, _Tile]
 
     @property
@@ -152,7 +152,7 @@ class _State:
     def kernels(self) -> KernelSet:
         tiles = list(self.tiles.values()) or [_NO_TILE]
         arrays: dict[str, Any] = {name: np.concatenate([getattr(t, name) for t in tiles]) for name in _ARRAYS}
-        return KernelSet(**arrays, **self.scalars, map_revision=self.revision)
+        return KernelSet(**arrays, rule=self.rule, map_revision=self.revision)
 
 
 _NONE = np.zeros(0, np.float32)
@@ -195,6 +195,10 @@ class _Reply:
             raise BadReplyError(
                 f"tiles: whole is {first.whole}, in epoch {first.epoch} after {state and state.epoch}"
             )
+        try:
+            rule = AnswerRule.of(first)
+        except ValueError as error:
+            raise BadReplyError(f"tiles: {error}") from error
         came = self._joined()
         kept = {} if state is None or first.whole else dict(state.tiles)
         gone = self._gone(kept)
@@ -205,7 +209,7 @@ class _Reply:
         now = _State(
             epoch=first.epoch,
             revision=first.map_revision,
-            scalars={name: getattr(first, name) for name in _SCALARS},
+            rule=rule,
             tiles=kept,
         )
         return now, MirrorUpdate(

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potschemas import keys, messages, wire
+from potschemas.answers import AnswerRule
 from potschemas.messages import DType, ErrorCode
 from potserver.adapters.kernel_coding import code_kernels
 from potserver.adapters.ports import Snapshot
@@ -22,7 +23,6 @@ from potserver.asking.tiles import MANTISSA_BITS, KnownTiles, TilesPlan
 from potserver.atoms.store import AtomChange
 from potserver.domain.running_scores import RunningScores
 from potserver.domain.types import (
-    AnswerRule,
     Atom,
     Float64,
     KernelSet,
@@ -730,10 +730,7 @@ def encode_kernels(kernels: KernelSet, rule: AnswerRule) -> messages.Kernels:
         gamma_rate=_float32(kernels.gamma_rate),
         weight_mean=_float32(kernels.weight_mean),
         weight_var=_float32(kernels.weight_var),
-        observed_activation=float(rule.observed_activation),
-        prior_var=float(rule.prior_var),
-        residual_var=float(rule.residual_var),
-        mean_moderation=float(rule.mean_moderation),
+        **rule.fields(),
     )
 
 
@@ -820,7 +817,7 @@ def encode_params_part(
 
 def encode_tiles_part(plan: TilesPlan, part: int) -> Wire:
     """One part of the reply to `q/tiles`; the tiles that are gone travel in part 0."""
-    run, rule = plan.part(part), plan.rule
+    run = plan.part(part)
     return _wire(
         messages.TilesPart(
             part=part,
@@ -833,10 +830,7 @@ def encode_tiles_part(plan: TilesPlan, part: int) -> Wire:
             counts=wire.pack_array(run.counts),
             gone=wire.pack_array(plan.gone.T) if part == 0 and len(plan.gone) else None,
             kernels=code_kernels(run.kernels, plan.spacings_m),
-            observed_activation=float(rule.observed_activation),
-            prior_var=float(rule.prior_var),
-            residual_var=float(rule.residual_var),
-            mean_moderation=float(rule.mean_moderation),
+            **plan.rule.fields(),
         )
     )
 
@@ -897,10 +891,7 @@ def encode_info(
             lower=[float(c) for c in hinges.min(axis=0)] if len(hinges) else None,
             upper=[float(c) for c in hinges.max(axis=0)] if len(hinges) else None,
             tile_size_m=float(tile_size_m),
-            observed_activation=float(snapshot.rule.observed_activation),
-            prior_var=float(snapshot.rule.prior_var),
-            residual_var=float(snapshot.rule.residual_var),
-            mean_moderation=float(snapshot.rule.mean_moderation),
+            **snapshot.rule.fields(),
             limits=messages.Limits(
                 max_cloud_bytes=limits.max_cloud_bytes,
                 max_cloud_points=limits.max_cloud_points,

@@ -8,12 +8,12 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from potschemas.answers import AnswerRule
 from potserver.asking.tiles import KnownTiles, TilesPlan
 from potserver.domain.dictionary import AtomDictionary
 from potserver.domain.map_state import MapState
 from potserver.domain.running_scores import RunningScores
 from potserver.domain.types import (
-    AnswerRule,
     Float64,
     KernelSet,
     MapUpdate,

@@ -8,9 +8,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from potschemas.answers import AnswerRule
 from potserver.domain.map_state import MapState
 from potserver.domain.tiles import Tile, TileIndex
-from potserver.domain.types import AnswerRule, Float32, Float64, KernelSet
+from potserver.domain.types import Float32, Float64, KernelSet
 
 Int64 = NDArray[np.int64]
 

@@ -9,6 +9,7 @@ from enum import Enum
 
 import numpy as np
 
+from potschemas.answers import AnswerRule
 from potserver.atoms.distance import atom_distances, near_in_spread
 from potserver.domain.dictionary import AtomDictionary
 from potserver.domain.kernel_map import KernelMap
@@ -101,7 +102,7 @@ def own_auc(atom: Atom) -> float:
 
     Near 1 for any sound atom. It says nothing about accuracy on other data.
     """
-    rank = KernelMap(atom.kernels, observed_activation=1e-3, threads=1)
+    rank = KernelMap(atom.kernels, rule=AnswerRule(observed_activation=1e-3), threads=1)
     hits, free = (rank.occupancy(points).latent_mean for points in (atom.hit_points, atom.free_points))
     free = np.sort(free)
     below = np.searchsorted(free, hits, "left") + np.searchsorted(free, hits, "right")

@@ -289,7 +289,7 @@ def _draw_prediction(mean: Any, std: Any, atom: Atom, view: _View, palette: _Pal
     )
     points = np.full((right.size, 3), view.level_m)
     points[:, view.right], points[:, view.up] = right.ravel(), up.ravel()
-    answer = KernelMap(atom.kernels, **DEFAULT_RULE._asdict(), threads=1).occupancy(points)
+    answer = KernelMap(atom.kernels, rule=DEFAULT_RULE, threads=1).occupancy(points)
     extent = (
         view.lower[0], view.lower[0] + n_right * cell, view.lower[1], view.lower[1] + n_up * cell
     )  # fmt: skip

@@ -26,7 +26,7 @@ from potserver.config import Settings
 from potserver.domain.dictionary import AtomDictionary
 from potserver.domain.kernel_map import KernelMap
 from potserver.domain.map_state import MapState
-from potserver.domain.types import AnswerRule, KernelSet
+from potserver.domain.types import KernelSet
 from potserver.errors import MapFileError, SettingsError
 from potserver.limits import Limits
 from potserver.mapping.imports import state_of_kernels, state_of_places
@@ -145,9 +145,7 @@ class UnservedMap:
         self._record = saved.record
         self._parts = [] if saved.tiled is None else [part.kernels for part in saved.tiled.parts.values()]
         indexed = [] if saved.tiled is None else list(saved.tiled.parts.values())
-        self._map = KernelMap(
-            indexed, **saved.record.answer_rule._asdict(), map_revision=saved.record.revision
-        )
+        self._map = KernelMap(indexed, rule=saved.record.answer_rule, map_revision=saved.record.revision)
 
     def info(self) -> messages.Info:
         """What the map is."""
@@ -249,7 +247,7 @@ def _with_rule(saved: SavedMap) -> MapState:
     """The state whose snapshot answers as the saved one did."""
     parts = [] if saved.tiled is None else list(saved.tiled.parts.values())
     state = saved.state()
-    snapshot = KernelMap(parts, **saved.record.answer_rule._asdict(), map_revision=saved.record.revision)
+    snapshot = KernelMap(parts, rule=saved.record.answer_rule, map_revision=saved.record.revision)
     return dataclasses.replace(state, snapshot=snapshot)
 
 
@@ -313,10 +311,7 @@ def places_of(leaves: Leaves, resolution: float, fine_m: float, looks: float = 1
 
 def _from_kernels(path: Path, settings: Settings) -> MapState:
     kernels = _read(lambda: ClientKernels.load(path), path)
-    rule = AnswerRule(
-        kernels.observed_activation, kernels.prior_var, kernels.residual_var, kernels.mean_moderation
-    )
-    make_pipeline = functools.partial(PotPipeline, method=PAPER._replace(rule=rule))
+    make_pipeline = functools.partial(PotPipeline, method=PAPER._replace(rule=kernels.rule))
     service = MappingService(
         AtomDictionary(()), settings.mapping, threads=settings.threads, make_pipeline=make_pipeline
     )

@@ -11,16 +11,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from potserver.domain.types import AnswerRule, Float32, Float64, KernelSet, Occupancy, Unknown
+from potschemas import answers
+from potschemas.answers import OBSERVED_ACTIVATION, AnswerRule, LatentSums
+from potserver.domain.types import Float32, Float64, KernelSet, Occupancy, Unknown
 from potserver.errors import BadPointsError, ShapeError
 from potserver.numerics import gradients, kernel_index, rays
-from potserver.numerics.occupancy import predict_occupancy
 from potserver.numerics.threads import default_threads
-
-# A point whose kernels sum to less activation than this is unobserved: nothing near it was ever seen.
-OBSERVED_ACTIVATION = 0.05
-# Variance of the latent where nothing is known, log-odds^2: a standard deviation of 10, anything from sure to sure.
-PRIOR_VAR = 100.0
 
 
 class IndexedKernels(NamedTuple):
@@ -30,7 +26,7 @@ class IndexedKernels(NamedTuple):
     lookup: kernel_index.KernelIndex
 
     @staticmethod
-    def of(kernels: KernelSet, observed_activation: float) -> IndexedKernels:
+    def of(kernels: KernelSet, observed_activation: float = OBSERVED_ACTIVATION) -> IndexedKernels:
         """Index kernels for maps with this `observed_activation`."""
         lookup = kernel_index.build_index(
             kernels.hinge_mean,
@@ -49,33 +45,24 @@ class KernelMap:
         self,
         kernels: KernelSet | Sequence[IndexedKernels],
         *,
-        observed_activation: float = OBSERVED_ACTIVATION,
-        prior_var: float = PRIOR_VAR,
-        residual_var: float = 0.0,
-        mean_moderation: float = 1.0,
+        rule: AnswerRule = AnswerRule(),
         map_revision: int = 0,
         threads: int | None = None,
     ) -> None:
         """Index the kernels. Answers use the mean of every hinge and every gamma; their dispersions are only kept.
 
         Args:
-            kernels: In the map frame; gamma enters by its mean. Or parts of them that were indexed before, at this
-                `observed_activation`: then only what is new about the map has to be built.
-            observed_activation: Points with a smaller activation sum answer 0.5, `prior_var`, and `observed` false.
-            prior_var: Latent variance of unobserved points, log-odds^2.
-            residual_var: What the kernels cannot know, log-odds^2: it is added to the latent variance in the measure that the
-                activation falls short of 1, so that certainty fades with the kernels. 0 is the paper's model, which is *surer*
-                the farther it is from all data.
-            mean_moderation: Share of the latent variance that pulls the mean towards 0.5; 1 is the paper's model. The variances
-                are of single weights, and what neighbours have in common is in none of them: 1 makes a map timid.
+            kernels: In the map frame; gamma enters by its mean. Or parts that were indexed before, at the rule's
+                `observed_activation`, so that only new parts cost time.
+            rule: What turns sums over the kernels into answers.
             map_revision: Carried into the answers.
             threads: Threads a query may use; all processors by default.
         """
-        self.rule = AnswerRule(observed_activation, prior_var, residual_var, mean_moderation)
+        self.rule = rule
         self.map_revision = map_revision
         self._threads = threads or default_threads()
         if isinstance(kernels, KernelSet):
-            kernels = [IndexedKernels.of(kernels, observed_activation)]
+            kernels = [IndexedKernels.of(kernels, rule.observed_activation)]
         self._parts = tuple(kernels)
         self._index = kernel_index.IndexParts.of([part.lookup for part in self._parts])
 
@@ -94,10 +81,7 @@ class KernelMap:
         weight_mean: ArrayLike,
         weight_var: ArrayLike,
         *,
-        observed_activation: float = OBSERVED_ACTIVATION,
-        prior_var: float = PRIOR_VAR,
-        residual_var: float = 0.0,
-        mean_moderation: float = 1.0,
+        rule: AnswerRule = AnswerRule(),
         threads: int | None = None,
     ) -> KernelMap:
         """A map from bare arrays, hinges and gammas without dispersion.
@@ -107,7 +91,7 @@ class KernelMap:
             gamma: (K,) 1/m^2, > 0.
             weight_mean: (K,) log-odds.
             weight_var: (K,) log-odds^2, >= 0; a variance, not a standard deviation.
-            observed_activation, prior_var, residual_var, mean_moderation, threads: As in the constructor.
+            rule, threads: As in the constructor.
         Raises:
             ShapeError: the arrays disagree on K, or gamma or a variance has an illegal sign, or something is not finite.
         """
@@ -129,14 +113,7 @@ class KernelMap:
             weight_mean=_float32(w),
             weight_var=_float32(v),
         )
-        return cls(
-            kernels,
-            observed_activation=observed_activation,
-            prior_var=prior_var,
-            residual_var=residual_var,
-            mean_moderation=mean_moderation,
-            threads=threads,
-        )
+        return cls(kernels, rule=rule, threads=threads)
 
     def __len__(self) -> int:
         return sum(len(part.kernels) for part in self._parts)
@@ -149,30 +126,9 @@ class KernelMap:
         Raises:
             ShapeError: not (N, 3) or (N, 2).
             BadPointsError: NaN or infinite coordinates.
-        Source: paper eq. 1; the moderated sigmoid of MacKay 1992; the residual variance is the diagonal correction of sparse
-            Gaussian processes (Snelson and Ghahramani 2006), in the kernels' own measure.
+        Source: paper eq. 1; `potschemas.answers`.
         """
-        sums = self.latent(as_points(points))
-        observed = sums.activation >= self.rule.observed_activation
-        latent_mean = np.where(observed, sums.mean, np.float32(0))
-        unexplained = np.maximum(np.float32(1) - sums.activation, np.float32(0))
-        latent_var = np.where(
-            observed,
-            sums.var + np.float32(self.rule.residual_var) * unexplained,
-            np.float32(self.rule.prior_var),
-        )
-        # float64: in float32 a sure answer would round to exactly 1 and cost an infinite log-loss when wrong
-        mean, var = predict_occupancy(
-            latent_mean.astype(np.float64), latent_var.astype(np.float64), self.rule.mean_moderation
-        )
-        return Occupancy(
-            mean=np.asarray(mean, np.float64),
-            var=np.asarray(var, np.float64),
-            latent_mean=latent_mean,
-            latent_var=latent_var,
-            observed=observed,
-            map_revision=self.map_revision,
-        )
+        return self._answer(self.latent(as_points(points)))
 
     def occupancy_with_gradient(self, points: ArrayLike) -> Occupancy:
         """`occupancy` and the analytic gradients of its mean and of its latent mean; both are 0 where nothing was observed.
@@ -180,21 +136,15 @@ class KernelMap:
         Args, Raises: As `occupancy`.
         """
         array = as_points(points)
-        answer = self.occupancy(array)
+        sums = self.latent(array)
         slopes = gradients.latent_gradients(self._whole, array, threads=self._threads, lane="query")
-        activation = self.latent(array).activation
-        # the residual variance falls only where it is there: below an activation of 1
-        residual = np.where(activation < 1.0, self.rule.residual_var, 0.0)
-        var_gradient = slopes.var - residual[:, None] * slopes.activation
-        known = answer.observed[:, None]
-        mean_gradient = gradients.occupancy_gradient(
-            answer.latent_mean, answer.latent_var, slopes.mean, var_gradient, self.rule.mean_moderation
-        )
+        of_answer = answers.gradients(sums, slopes, self.rule)
         return dataclasses.replace(
-            answer,
-            gradient=np.where(known, mean_gradient, 0.0),
-            latent_gradient=np.where(known, slopes.mean, 0.0).astype(np.float64),
+            self._answer(sums), gradient=of_answer.mean, latent_gradient=of_answer.latent_mean
         )
+
+    def _answer(self, sums: LatentSums) -> Occupancy:
+        return Occupancy(**answers.answer(sums, self.rule)._asdict(), map_revision=self.map_revision)
 
     def first_returns(
         self,
@@ -223,9 +173,7 @@ class KernelMap:
             quantiles=quantiles,
             unknown_rate=rate[unknown],
             width_m=width_m,
-            observed_activation=self.rule.observed_activation,
-            residual_var=self.rule.residual_var,
-            mean_moderation=self.rule.mean_moderation,
+            rule=self.rule,
             threads=self._threads,
         )
 
@@ -257,7 +205,7 @@ class KernelMap:
         mean = weighted.mean / np.where(reached, weighted.activation, np.float32(1))
         return np.where(reached, mean.astype(np.float64), self.typical_width_m)
 
-    def latent(self, points: Float64) -> kernel_index.LatentSums:
+    def latent(self, points: Float64) -> LatentSums:
         """The bare sums of eq. 1 at (N, 3) points, with no rule for unobserved ones."""
         return kernel_index.latent_sums_of_parts(self._index, points, threads=self._threads, lane="query")
 

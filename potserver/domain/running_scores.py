@@ -7,8 +7,8 @@ import math
 
 import numpy as np
 
+from potschemas.answers import occupancy_mean
 from potserver.domain.types import Bool, Float32, Float64
-from potserver.numerics.occupancy import predict_occupancy
 
 # Shares of the latent variance that may pull means towards 0.5; the best of them on the checked beams is used.
 MODERATIONS = (0.0, 0.0125, 0.025, 0.05, 0.1, 0.2, 0.4, 1.0)
@@ -40,17 +40,13 @@ class RunningScores:
         if len(occupied) == 0:
             return self
         keep = math.exp(-len(occupied) / _MEMORY)
-        mean64, var64 = latent_mean.astype(np.float64), latent_var.astype(np.float64)
         truth = occupied.astype(np.float64)
 
-        def probability(share: float) -> Float64:
-            return np.asarray(predict_occupancy(mean64, var64, share)[0], np.float64)
-
         def nll(share: float) -> float:
-            p = np.clip(probability(share), _CLIP, 1.0 - _CLIP)
+            p = np.clip(occupancy_mean(latent_mean, latent_var, share), _CLIP, 1.0 - _CLIP)
             return float(-np.log(np.where(occupied, p, 1.0 - p)).sum())
 
-        p = probability(moderation)
+        p = occupancy_mean(latent_mean, latent_var, moderation)
         member = np.minimum((p * _N_BINS).astype(np.int64), _N_BINS - 1)
         new = np.stack([np.bincount(member, w, _N_BINS) for w in (np.ones(len(p)), p, truth)], axis=1)
         return RunningScores(

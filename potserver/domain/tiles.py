@@ -157,9 +157,7 @@ class TiledMap(NamedTuple):
             return self, self.robots.index(robot_id)
         return self._replace(robots=(*self.robots, robot_id)), len(self.robots)
 
-    def with_tiles(
-        self, changed: Mapping[TileIndex, Tile], observed_activation: float, *, threads: int = 1
-    ) -> TiledMap:
+    def with_tiles(self, changed: Mapping[TileIndex, Tile], *, threads: int = 1) -> TiledMap:
         """The map with some tiles exchanged, or gone if they are empty; only the parts that they lie in are indexed again."""
         tiles = dict(self.tiles)
         for index, tile in changed.items():
@@ -175,7 +173,7 @@ class TiledMap(NamedTuple):
             members = [tiles[index].kernels.kernels for index in found]
             shift = np.repeat(np.reshape(found, (-1, 3)), [len(m) for m in members], axis=0)
             kernels = KernelSet.concatenate(members).moved(np.asarray(shift * self.grid.size_m, np.float64))
-            return IndexedKernels.of(kernels, observed_activation)
+            return IndexedKernels.of(kernels)
 
         touched = list(dict.fromkeys(part_of(index) for index in changed))
         parts = dict(self.parts)

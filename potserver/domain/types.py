@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from potschemas.answers import AnswerRule
 from potserver.errors import BadPointsError, BadPoseError, EmptyError, ShapeError
 from potserver.numerics.beams import Beams
 
@@ -237,15 +238,6 @@ class SectorMatch(NamedTuple):
     marginal_error: float
     n_iterations: int
     reason: str | None = None
-
-
-class AnswerRule(NamedTuple):
-    """What turns sums over kernels into answers; it travels with every set of kernels, so that all who have them agree."""
-
-    observed_activation: float  # a point with less summed activation is unobserved
-    prior_var: float  # log-odds^2, latent variance of unobserved points
-    residual_var: float  # log-odds^2, added in the measure that the activation falls short of 1
-    mean_moderation: float = 1.0  # share of the latent variance that pulls the mean towards 0.5
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False, kw_only=True)

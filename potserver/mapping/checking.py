@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from potserver.domain.kernel_map import KernelMap
 from potserver.domain.running_scores import RunningScores
 from potserver.domain.types import Float64
@@ -27,5 +25,6 @@ def check(
     """
     asked = label_beams(beams, free_per_beam=1, gap_m=_GAP_M, rng=draws.check)
     answer = snapshot.occupancy(asked.points + origin)
-    latent_mean = np.where(answer.observed, answer.latent_mean, np.float32(0))
-    return scores.with_points(latent_mean, answer.latent_var, asked.occupied, snapshot.rule.mean_moderation)
+    return scores.with_points(
+        answer.latent_mean, answer.latent_var, asked.occupied, snapshot.rule.mean_moderation
+    )

@@ -33,7 +33,7 @@ class DefaultPipeline(Pipeline):
         look = Look(seen.labelled, seen.beams.learned, scan.origin, source, scan.is_planar)
         own, fused = self.learn(tiled, look, seen, moment, carrier, clock)
         with clock("index"):
-            tiled, fused = self.age(self.indexed(tiled, fused.tiles, self.threads), fused, moment)
+            tiled, fused = self.age(tiled.with_tiles(fused.tiles, threads=self.threads), fused, moment)
             snapshot = self.snapshot(tiled, moment.revision, state.scores)
         with clock("check"):
             scores = self.check(snapshot, seen, state.scores, draws)
@@ -89,4 +89,4 @@ class DefaultPipeline(Pipeline):
         if stale is None:
             return tiled, fused
         aged, _ = refit(tiled, stale, moment, threads=self.threads)
-        return self.indexed(tiled, aged, 1), fused._replace(tiles=fused.tiles | aged)
+        return tiled.with_tiles(aged), fused._replace(tiles=fused.tiles | aged)

@@ -6,7 +6,6 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from potserver.domain.kernel_map import OBSERVED_ACTIVATION
 from potserver.domain.tiles import CARRIED, MapKernels, Region, TiledMap, TileIndex, part_of, tiles_of_part
 from potserver.domain.types import Float64, check_rigid
 from potserver.errors import UnknownRobotError, UnsupportedError
@@ -160,4 +159,4 @@ def _settle(
             done.update(tiles)
     done.update(changed)
     settled = {index: tiled.tiles[index] for index in done if index in tiled.tiles}
-    return tiled.with_tiles(settled, OBSERVED_ACTIVATION, threads=threads), done
+    return tiled.with_tiles(settled, threads=threads), done

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from potserver.domain.kernel_map import PRIOR_VAR
+from potschemas.answers import PRIOR_VAR
 from potserver.domain.tiles import (
     CARRIED,
     COARSE,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from potserver.domain.kernel_map import OBSERVED_ACTIVATION, KernelMap
+from potserver.domain.kernel_map import KernelMap
 from potserver.domain.map_state import MapState
 from potserver.domain.tiles import Region, TiledMap, TileGrid
 from potserver.domain.types import Bool, Float32, Float64, KernelSet
@@ -65,7 +65,7 @@ def state_of_kernels(service: MappingService, kernels: KernelSet) -> MapState:
     settings = service.settings
     tiled = TiledMap.empty(TileGrid.of(settings.tile_size_m, settings.resolution_m or 0.2))
     tiles = append(tiled, kernels, Moment(1, 0))
-    tiled = tiled.with_tiles(tiles, OBSERVED_ACTIVATION)
+    tiled = tiled.with_tiles(tiles)
     empty = KernelMap(KernelSet.empty(), map_revision=1)
     service.restore(MapState(snapshot=empty, tiled=tiled))
     return service.state

@@ -12,9 +12,9 @@ without any kernel near are answered as unobserved.
 
 from __future__ import annotations
 
-from potserver.domain.kernel_map import OBSERVED_ACTIVATION, PRIOR_VAR
+from potschemas.answers import AnswerRule
 from potserver.domain.map_state import MapState
-from potserver.domain.types import AnswerRule, KernelSet, Scan
+from potserver.domain.types import KernelSet, Scan
 from potserver.mapping.carrying import Carrier
 from potserver.mapping.fusion import Fused, append
 from potserver.mapping.matching import Ranking, RankScore
@@ -47,7 +47,7 @@ PAPER = Method(
         is_label_aware=False,
         stays_in_sector=False,
     ),
-    rule=AnswerRule(OBSERVED_ACTIVATION, PRIOR_VAR, residual_var=0.0, mean_moderation=1.0),
+    rule=AnswerRule(),  # the paper's model
     is_calibrated=False,
 )
 
@@ -68,7 +68,7 @@ class PotPipeline(Pipeline):
         own = ScanMap(carried.reports(), kernels, kernels, converged=True)
         fused = Fused(append(tiled, kernels, moment), len(kernels), len(kernels), True)
         with clock("index"):
-            tiled = self.indexed(tiled, fused.tiles, self.threads)
+            tiled = tiled.with_tiles(fused.tiles, threads=self.threads)
             snapshot = self.snapshot(tiled, moment.revision, state.scores)
         with clock("check"):
             scores = self.check(snapshot, seen, state.scores, draws)

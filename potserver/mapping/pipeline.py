@@ -7,15 +7,15 @@ from __future__ import annotations
 
 import dataclasses
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
 from typing import NamedTuple
 
+from potschemas.answers import AnswerRule
 from potserver.domain.dictionary import AtomDictionary
-from potserver.domain.kernel_map import OBSERVED_ACTIVATION, PRIOR_VAR, KernelMap
+from potserver.domain.kernel_map import KernelMap
 from potserver.domain.map_state import MapState
 from potserver.domain.running_scores import RunningScores
-from potserver.domain.tiles import Tile, TiledMap, TileIndex
-from potserver.domain.types import AnswerRule, KernelSet, MapUpdate, Scan, Sector, SectorMatch, TileChange
+from potserver.domain.tiles import TiledMap
+from potserver.domain.types import KernelSet, MapUpdate, Scan, Sector, SectorMatch, TileChange
 from potserver.mapping.carrying import Carried, Carrier
 from potserver.mapping.checking import check
 from potserver.mapping.fusion import SCAN_EFFORT, FitEffort, Fused, Moment, grid_for
@@ -28,7 +28,7 @@ from potserver.mapping.transport import CouplingOptions
 from potserver.numerics.beams import LabelledPoints, label_beams
 
 # `mean_moderation` of a twentieth: variances are of single weights, and all of them would make the map timid
-DEFAULT_RULE = AnswerRule(OBSERVED_ACTIVATION, PRIOR_VAR, residual_var=50.0, mean_moderation=0.05)
+DEFAULT_RULE = AnswerRule(residual_var=50.0, mean_moderation=0.05)
 
 
 class Method(NamedTuple):
@@ -112,9 +112,9 @@ class Pipeline(ABC):
         """What a map answers from, by what its self-check has found so far."""
         rule = self.method.rule
         if self.method.is_calibrated:
-            rule = rule._replace(mean_moderation=scores.moderation(rule.mean_moderation))
+            rule = dataclasses.replace(rule, mean_moderation=scores.moderation(rule.mean_moderation))
         parts = list(tiled.parts.values()) if tiled is not None else []
-        return KernelMap(parts, **rule._asdict(), map_revision=revision, threads=self.threads)
+        return KernelMap(parts, rule=rule, map_revision=revision, threads=self.threads)
 
     # --- the steps of a scan ---------------------------------------------------------------------------------------------
 
@@ -157,10 +157,6 @@ class Pipeline(ABC):
     ) -> RunningScores:
         """Ask the new map about the beams that it did not learn."""
         return check(snapshot, seen.beams.checked, seen.scan.origin, scores, draws)
-
-    def indexed(self, tiled: TiledMap, tiles: Mapping[TileIndex, Tile], threads: int) -> TiledMap:
-        """The map with some tiles exchanged."""
-        return tiled.with_tiles(tiles, self.method.rule.observed_activation, threads=threads)
 
 
 def integrated(

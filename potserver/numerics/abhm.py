@@ -35,10 +35,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from potschemas.answers import sigmoid
 from potserver.errors import EmptyError, ShapeError, SolverError
 from potserver.numerics.fastexp import FAST, exp32
 from potserver.numerics.feature_blocks import feature_blocks, gradient_and_diagonal, product
-from potserver.numerics.occupancy import sigmoid
 from potserver.numerics.threads import parallel_map
 from potserver.numerics.warm_fit import WarmFit, warm_fit
 

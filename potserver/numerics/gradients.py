@@ -1,17 +1,13 @@
-"""Gradients of the latent's sums, and of the occupancy probability that follows from them. All analytic."""
+"""Gradients of the sums that `kernel_index` makes: analytic, over the kernels that reach each point."""
 
 from __future__ import annotations
 
-import math
-from typing import NamedTuple
-
 import numba as nb
 import numpy as np
-from numpy.typing import NDArray
 
+from potschemas.answers import LatentGradients
 from potserver.numerics.fastexp import FAST, exp32
 from potserver.numerics.kernel_index import (
-    Float32,
     Float64,
     KernelIndex,
     _about_middle,
@@ -19,16 +15,7 @@ from potserver.numerics.kernel_index import (
     _gather,
     group_points,
 )
-from potserver.numerics.occupancy import Float, predict_occupancy
 from potserver.numerics.threads import parallel_map, spans
-
-
-class LatentGradients(NamedTuple):
-    """Gradients of the sums of `kernel_index.LatentSums` at N points, each (N, 3), per metre."""
-
-    mean: Float32
-    var: Float32
-    activation: Float32
 
 
 def latent_gradients(
@@ -39,6 +26,8 @@ def latent_gradients(
     Args:
         points: (N, 3) float64, m, same frame as the hinges.
         threads, lane: See `kernel_index.latent_sums`.
+    Returns:
+        float32.
     """
     n = len(points)
     out = np.zeros((9, n), np.float32)
@@ -56,28 +45,6 @@ def latent_gradients(
         parallel_map(run, spans(len(cuts) - 1, 16 * threads if threads > 1 else 1), threads, lane)
         out[:, order] = sums
     return LatentGradients(*(np.ascontiguousarray(out[i : i + 3].T) for i in (0, 3, 6)))
-
-
-def occupancy_gradient(
-    latent_mean: Float,
-    latent_var: Float,
-    mean_gradient: Float,
-    var_gradient: Float,
-    mean_moderation: float = 1.0,
-) -> NDArray[np.float64]:
-    """(N, 3) gradient of sigmoid(mu / sqrt(1 + c pi s2 / 8)), per metre, from those of mu and s2.
-
-    Args:
-        latent_mean, latent_var: (N,) mu, log-odds, and s2, log-odds^2.
-        mean_gradient, var_gradient: (N, 3) theirs, per metre.
-        mean_moderation: c, see `predict_occupancy`.
-    """
-    mu, s2 = np.asarray(latent_mean, np.float64), np.asarray(latent_var, np.float64)
-    c = mean_moderation * math.pi
-    scale = 1.0 / np.sqrt(1.0 + (c / 8.0) * s2)
-    p = predict_occupancy(mu, s2, mean_moderation).mean
-    z_gradient = scale[:, None] * mean_gradient - (c / 16.0) * (mu * scale**3)[:, None] * var_gradient
-    return np.asarray((p * (1.0 - p))[:, None] * z_gradient, np.float64)
 
 
 @nb.njit(nogil=True, fastmath=FAST, error_model="numpy", cache=True)

@@ -19,6 +19,7 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from potschemas.answers import LatentSums
 from potserver.numerics.cubes import sort_into_cubes
 from potserver.numerics.fastexp import FAST, exp32
 from potserver.numerics.geometry import bounds, inside_box
@@ -182,14 +183,6 @@ def build_index(
     )
 
 
-class LatentSums(NamedTuple):
-    """Sums of eq. 1 and of its variance at N points."""
-
-    mean: Float32  # (N,) log-odds
-    var: Float32  # (N,) log-odds^2
-    activation: Float32  # (N,) sum of phi
-
-
 def latent_sums(index: KernelIndex, points: Float64, *, threads: int = 1, lane: str = "map") -> LatentSums:
     """Evaluate the kernels of an index.
 
@@ -197,6 +190,8 @@ def latent_sums(index: KernelIndex, points: Float64, *, threads: int = 1, lane: 
         points: (N, 3) float64, m, same frame as the hinges.
         threads: Threads to spread the points over.
         lane: See `threads.parallel_map`.
+    Returns:
+        float32.
     Source: paper eq. 1; variance of a factorised posterior.
     """
     n = len(points)

@@ -19,6 +19,7 @@ from typing import NamedTuple
 import numba as nb
 import numpy as np
 
+from potschemas.answers import AnswerRule
 from potserver.numerics.fastexp import FAST, exp32
 from potserver.numerics.kernel_index import Float64, Int64, KernelIndex, _gather
 from potserver.numerics.threads import parallel_map, spans
@@ -74,9 +75,7 @@ def first_returns(
     quantiles: Float64,
     unknown_rate: float,
     width_m: float | None,
-    observed_activation: float,
-    residual_var: float,
-    mean_moderation: float = 1.0,
+    rule: AnswerRule,
     threads: int = 1,
 ) -> FirstReturns:
     """March rays by the midpoint rule, whose error falls with the square of the step.
@@ -91,7 +90,7 @@ def first_returns(
         quantiles: (Q,) ascending, in (0, 1).
         unknown_rate: Hazard of unobserved space, 1/m; infinite = it stops a ray at once.
         width_m: What counts as one trial, m; None = the kernels' own.
-        observed_activation, residual_var, mean_moderation: See `KernelMap`.
+        rule: What the kernels' sums say.
         threads: Threads to spread the rays over.
     """
     # copies: the compiled march is one for plain writable arrays, and received ones are read-only
@@ -109,13 +108,22 @@ def first_returns(
     def run(span: tuple[int, int]) -> None:
         _march(
             span[0], span[1], origins, directions, max_range_m, n_steps, block, thresholds, float(unknown_rate),
-            -1.0 if width_m is None else float(width_m), float(observed_activation), float(residual_var),
-            float(mean_moderation), index.hinge, index.columns, widths, index.level_start, index.level_edge, index.level_cell,
+            -1.0 if width_m is None else float(width_m), rule.observed_activation, rule.residual_var,
+            rule.mean_moderation, index.hinge, index.columns, widths, index.level_start, index.level_edge, index.level_cell,
             index.level_size, index.keys, out, quantile_m,
         )  # fmt: skip
 
     parallel_map(run, spans(n, 8 * threads if threads > 1 else 1), threads, "query")
     return FirstReturns(out[0], out[1], out[2], quantile_m, out[3], out[4])
+
+
+@nb.njit(error_model="numpy", cache=True)
+def moderated(
+    mean: float, var: float, activation: float, residual_var: float, mean_moderation: float
+) -> float:
+    """z of the occupancy sigmoid(z) that sums at an observed point give: `potschemas.answers`, compiled for one point."""
+    s2 = var + residual_var * max(1.0 - activation, 0.0)
+    return mean / math.sqrt(1.0 + mean_moderation * math.pi / 8.0 * s2)
 
 
 @nb.njit(error_model="numpy", cache=True)
@@ -207,9 +215,8 @@ def _march(
             )
             if n > 0 and activation >= observed_activation:
                 is_known = True
-                s2 = var + residual_var * max(1.0 - activation, 0.0)
                 width = fixed_width_m if fixed_width_m > 0 else weighted / activation
-                rate = _softplus(mean / math.sqrt(1.0 + mean_moderation * math.pi / 8.0 * s2)) / width
+                rate = _softplus(moderated(mean, var, activation, residual_var, mean_moderation)) / width
             else:
                 is_known = False
                 rate = unknown_rate

@@ -8,6 +8,7 @@ map      one row: everything else (`MapRecord`) as JSON, and its digest; it coun
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import sqlite3
 import time
 from collections.abc import Iterable, Mapping
@@ -19,12 +20,13 @@ import msgspec
 import numpy as np
 
 from potschemas import __version__
+from potschemas.answers import AnswerRule
 from potserver.domain.folders import sync_folder
 from potserver.domain.kernel_map import KernelMap
 from potserver.domain.map_state import MapState
 from potserver.domain.running_scores import RunningScores
 from potserver.domain.tiles import Tile, TiledMap, TileGrid, TileIndex
-from potserver.domain.types import AnswerRule, KernelSet
+from potserver.domain.types import KernelSet
 from potserver.errors import MapFileError, StorageError
 from potserver.storage.sqlite import Kind, after_damage, connect, connect_read_only, reading, transaction
 from potserver.storage.tile_codec import DIGEST_BYTES, decode_tile, digest_of, encode_tile
@@ -64,6 +66,9 @@ class MapRecord(msgspec.Struct, frozen=True, kw_only=True):
     scores_bins: list[list[float]]
     n_tiles: int
     tiles_digest: str  # sum of the tiles' digests, hexadecimal
+
+    def __post_init__(self) -> None:
+        AnswerRule(*self.rule)  # raises ValueError where it is none
 
     @property
     def answer_rule(self) -> AnswerRule:
@@ -124,15 +129,13 @@ class MapFile:
         self._written: dict[TileIndex, tuple[int, int]] = {}  # revision and digest of each tile
         self._epoch: int | None = None  # which those revisions are of
 
-    def read(self, observed_activation: float) -> SavedMap | None:
+    def read(self) -> SavedMap | None:
         """The map, or None where none was written yet; from now on only what differs from it is written.
 
-        Args:
-            observed_activation: Of the rule that the kernels are indexed for.
         Raises:
             MapFileError: it is damaged.
         """
-        saved = _read(self._connection, self.path, observed_activation, self._written)
+        saved = _read(self._connection, self.path, self._written)
         self._epoch = None if saved is None else saved.record.epoch
         return saved
 
@@ -211,17 +214,16 @@ def write_map(path: Path, state: MapState, origin: Origin) -> int:
     return n_bytes
 
 
-def read_map(path: Path, observed_activation: float | None = None) -> SavedMap:
+def read_map(path: Path) -> SavedMap:
     """Read a `*.map` file or a store's `tiles.sqlite`.
 
     Args:
         path: The file.
-        observed_activation: Of the rule that the kernels are indexed for; by default the one that the file names.
     Raises:
         MapFileError: there is no such file, or it is damaged, of another version, or holds no map yet.
     """
     with contextlib.closing(connect_read_only(path, _KIND)) as connection:
-        saved = _read(connection, path, observed_activation, {})
+        saved = _read(connection, path, {})
     if saved is None:
         raise MapFileError(f"{path} holds no map yet", reason="empty")
     return saved
@@ -263,7 +265,7 @@ def _record_of(state: MapState, origin: Origin, tiles: Mapping[TileIndex, tuple[
         robots=[] if tiled is None else list(tiled.robots),
         stamps=dict(origin.stamps),
         keeps_evidence=origin.keeps_evidence,
-        rule=(rule.observed_activation, rule.prior_var, rule.residual_var, rule.mean_moderation),
+        rule=dataclasses.astuple(rule),
         scores_n=scores.n_points,
         scores_nll=scores.nll.tolist(),
         scores_brier=scores.brier,
@@ -276,7 +278,6 @@ def _record_of(state: MapState, origin: Origin, tiles: Mapping[TileIndex, tuple[
 def _read(
     connection: sqlite3.Connection,
     path: Path,
-    observed_activation: float | None,
     written: dict[TileIndex, tuple[int, int]],
 ) -> SavedMap | None:
     """Read everything in one transaction, so that a writer beside us does not matter; `written` is filled."""
@@ -306,9 +307,7 @@ def _read(
         raise _damaged(path, f"it has {len(tiles)} tiles, and not the {record.n_tiles} that were written")
     if grid is None:
         return SavedMap(record, None)
-    rule = record.answer_rule
-    activation = rule.observed_activation if observed_activation is None else observed_activation
-    tiled = TiledMap.empty(grid)._replace(robots=tuple(record.robots)).with_tiles(tiles, activation)
+    tiled = TiledMap.empty(grid)._replace(robots=tuple(record.robots)).with_tiles(tiles)
     return SavedMap(record, tiled)
 
 

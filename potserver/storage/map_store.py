@@ -19,7 +19,6 @@ from potserver.adapters import codec
 from potserver.adapters.log import get_logger
 from potserver.adapters.ports import Mapper
 from potserver.adapters.threads import spawn
-from potserver.domain.kernel_map import OBSERVED_ACTIVATION
 from potserver.domain.map_state import MapState
 from potserver.domain.types import Scan
 from potserver.errors import (
@@ -127,7 +126,7 @@ class MapStore:
             MapFileError: something that must be there is damaged or missing, or the settings do not fit the map.
         """
         started_s = time.perf_counter()
-        saved = self._tiles.read(OBSERVED_ACTIVATION)
+        saved = self._tiles.read()
         self._check_whole(saved)
         stamps: dict[str, int] = {}
         if saved is not None:
@@ -279,7 +278,7 @@ class MapStore:
         if not path.is_file():
             names = ", ".join(sorted(p.stem for p in self._saved.glob("*.map"))) or "none"
             raise UnknownMapError(f"no map was saved as {name!r}; there are: {names}")
-        saved = read_map(path, OBSERVED_ACTIVATION)
+        saved = read_map(path)
         self._check_fits(mapper, saved, path)
         revision = max(mapper.state.map_revision, saved.record.revision) + 1
         return saved.state(epoch=secrets.randbits(62), revision=revision), dict(saved.record.stamps)

@@ -1,4 +1,4 @@
-"""potschemas: the wire contract of potserver. Messages, keys, and bytes; nothing else."""
+"""potschemas: the wire contract of potserver. Messages, keys, bytes, and what kernels answer."""
 
 from potschemas.version import __version__
 

@@ -119,12 +119,10 @@ class Pose(Message, frozen=True, kw_only=True):
 
 
 class Kernels(Message, frozen=True, kw_only=True):
-    """K kernels in the map frame, ten numbers each, and the scalars that turn them into answers.
+    """K kernels in the map frame, ten numbers each, and the rule that turns them into answers: its last four fields.
 
-    f(x) = sum_m w_m exp(-gamma_m |x - h_m|^2), gamma_m = gamma_shape_m / gamma_rate_m. A point whose summed
-    activation is below `observed_activation` is unobserved: 0.5, with latent variance `prior_var`. Elsewhere the
-    latent variance is sum_m weight_var_m phi_m^2 + residual_var * max(0, 1 - sum_m phi_m), and the mean is
-    sigmoid(f / sqrt(1 + mean_moderation pi latent_var / 8)).
+    The latent is f(x) = sum_m w_m exp(-gamma_m |x - h_m|^2), gamma_m = gamma_shape_m / gamma_rate_m. `potschemas.answers`
+    and "From kernels to answers" in the README have what follows from it.
     """
 
     schema: ClassVar[str] = "pot.kernels.v1"

@@ -13,11 +13,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from potschemas import messages, wire
+from potschemas.answers import AnswerRule
 from potschemas.messages import DType, ErrorCode, ReceiptStatus
 from potserver import errors
 from potserver.adapters import codec
 from potserver.domain.types import (
-    AnswerRule,
     Atom,
     KernelSet,
     MapUpdate,

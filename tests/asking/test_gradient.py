@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from potclient.kernels import KernelSet as ClientKernels
+from potschemas.answers import AnswerRule
 from potserver.adapters import codec
 from potserver.asking.service import QueryService
 from potserver.domain.dictionary import AtomDictionary
@@ -29,7 +30,7 @@ def scene(k: int = 400, shift_m: float = 0.0, residual_var: float = 20.0) -> Ker
         rng.uniform(0.3, 4.0, k),
         rng.normal(0.0, 3.0, k),
         rng.uniform(0.1, 2.0, k),
-        residual_var=residual_var,
+        rule=AnswerRule(residual_var=residual_var),
         threads=2,
     )
 
@@ -109,7 +110,7 @@ def test_offline_gradients_are_exact_in_float64() -> None:
             weight_mean=k.weight_mean,
             weight_var=k.weight_var,
         ),
-        residual_var=20.0,
+        rule=AnswerRule(residual_var=20.0),
     )
     points = np.random.default_rng(1).uniform(-4, 4, (200, 3))
     answer = offline.occupancy(points, gradient=True)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from potclient.towns import open_town
+from potschemas.answers import AnswerRule
 from potserver.asking.service import QueryService
 from potserver.domain.dictionary import AtomDictionary
 from potserver.domain.kernel_map import KernelMap
@@ -43,7 +44,7 @@ def scene(k: int = 300, seed: int = 0, *, shift_m: float = 0.0, **rule: float) -
         rng.normal(-2.0, 3.0, k),
         rng.uniform(0.1, 2.0, k),
         threads=1,
-        **rule,
+        rule=AnswerRule(**rule),
     )
 
 
@@ -228,7 +229,7 @@ def test_what_is_gathered_together_does_not_matter(
 def test_parts_and_threads_do_not_matter() -> None:
     origins, directions = some_rays(50)
     kernels = scene()
-    many = KernelMap(kernels.kernels, observed_activation=kernels.rule.observed_activation, threads=3)
+    many = KernelMap(kernels.kernels, rule=kernels.rule, threads=3)
     plan = service_of(many).rays(origins, directions, 10.0, part_samples=300)
     assert plan.n_parts > 5
     answer = plan.result(plan.part(i) for i in range(plan.n_parts))

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from potschemas.answers import AnswerRule
 from potserver.asking.service import QueryService
 from potserver.domain.dictionary import AtomDictionary
 from potserver.domain.kernel_map import KernelMap
@@ -40,7 +41,7 @@ def scene(seed: int = 0, k: int = 250) -> KernelMap:
         rng.uniform(0.5, 3.0, k),
         rng.normal(-2.0, 2.0, k),
         rng.uniform(0.1, 2.0, k),
-        residual_var=10.0,
+        rule=AnswerRule(residual_var=10.0),
         threads=1,
     )
 

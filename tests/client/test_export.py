@@ -64,6 +64,7 @@ def test_ply_has_all_ten_numbers_of_every_kernel(client: MapClient, tmp_path: Pa
     for name in ("gamma_shape", "gamma_rate", "weight_mean", "weight_var"):
         np.testing.assert_array_equal(rows[name], getattr(kernels, name))
     assert (rows["red"] > 230).all(), "a weight of 3 is occupied"
+    assert {f"{name} {value:g}" for name, value in kernels.rule.fields().items()} <= set(ply.comments)
     assert "prior_var 50" in ply.comments
     assert "map_revision 7" in ply.comments
     assert [p.name for p in tmp_path.iterdir()] == ["k.ply"]

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 from hypothesis import given
@@ -16,6 +18,7 @@ from potclient.holdout import HoldOut, LabelledPoints
 from potclient.kernels import KernelSet
 from potclient.metrics import score
 from potschemas import messages
+from potschemas.answers import AnswerRule
 from potschemas.wire import encode_array
 
 
@@ -32,10 +35,7 @@ def kernels(k: int = 50, seed: int = 0, *, offset_m: float = 0.0, revision: int 
         gamma_rate=f32(1, 3, k),
         weight_mean=f32(-4, 4, k),
         weight_var=f32(0.1, 3, k),
-        observed_activation=0.05,
-        prior_var=40.0,
-        residual_var=20.0,
-        mean_moderation=0.25,
+        rule=AnswerRule(observed_activation=0.05, prior_var=40.0, residual_var=20.0, mean_moderation=0.25),
         map_revision=revision,
     )
 
@@ -53,12 +53,12 @@ def slow_answer(
         mu += float(ks.weight_mean[m]) * phi
         s2 += float(ks.weight_var[m]) * phi * phi
         activation += phi
-    s2 += ks.residual_var * max(0.0, 1.0 - activation)
-    observed = activation >= ks.observed_activation
+    s2 += ks.rule.residual_var * max(0.0, 1.0 - activation)
+    observed = activation >= ks.rule.observed_activation
     if not observed:
-        mu, s2 = 0.0, ks.prior_var
+        mu, s2 = 0.0, ks.rule.prior_var
     scale = 1.0 / math.sqrt(1.0 + math.pi * s2 / 8.0)
-    mean = 1.0 / (1.0 + math.exp(-mu / math.sqrt(1.0 + ks.mean_moderation * math.pi * s2 / 8.0)))
+    mean = 1.0 / (1.0 + math.exp(-mu / math.sqrt(1.0 + ks.rule.mean_moderation * math.pi * s2 / 8.0)))
     return mean, mean * (1.0 - mean) * (1.0 - scale), mu, s2, observed
 
 
@@ -77,11 +77,11 @@ def test_occupancy_is_the_contract_formula(offset_m: float) -> None:
 def test_far_from_all_kernels_is_unknown_and_not_free() -> None:
     ks = kernels()
     answer = ks.occupancy([[1000.0, 0.0, 0.0]])
-    scale = 1 / math.sqrt(1 + math.pi * ks.prior_var / 8)
+    scale = 1 / math.sqrt(1 + math.pi * ks.rule.prior_var / 8)
     assert not answer.observed[0]
     assert answer.mean[0] == 0.5
     assert answer.latent_mean[0] == 0.0
-    assert answer.latent_var[0] == ks.prior_var
+    assert answer.latent_var[0] == ks.rule.prior_var
     assert answer.var[0] == pytest.approx(0.25 * (1 - scale))
 
 
@@ -136,9 +136,7 @@ def test_a_set_whose_arrays_disagree_is_refused() -> None:
                     for f in ("hinge_mean", "hinge_var", "gamma_shape", "gamma_rate", "weight_var")
                 },
                 "weight_mean": np.zeros(3, np.float32),
-                "observed_activation": 0.1,
-                "prior_var": 1.0,
-                "residual_var": 1.0,
+                "rule": AnswerRule(0.1, 1.0, 1.0),
             }
         )
 
@@ -151,12 +149,7 @@ def test_saved_kernels_come_back(tmp_path: Path) -> None:
     for name in ("hinge_mean", "hinge_var", "gamma_shape", "gamma_rate", "weight_mean", "weight_var"):
         np.testing.assert_array_equal(getattr(back, name), getattr(ks, name))
         assert getattr(back, name).dtype == getattr(ks, name).dtype
-    assert (back.observed_activation, back.prior_var, back.residual_var, back.map_revision) == (
-        0.05,
-        40.0,
-        20.0,
-        3,
-    )
+    assert (back.rule, back.map_revision) == (ks.rule, 3)
 
 
 @pytest.mark.parametrize("content", [b"", b"PK\x03\x04 truncated", b"hello"])
@@ -177,12 +170,29 @@ def test_a_message_keeps_precision_far_from_the_origin() -> None:
 
 
 def test_a_message_with_arrays_that_disagree_is_a_bad_reply() -> None:
-    import msgspec
-
     message = msgspec.structs.replace(kernels().to_message(), weight_var=encode_array(np.ones(3, np.float32)))
     assert isinstance(message, messages.Kernels)
     with pytest.raises(BadReplyError, match="weight_var"):
         KernelSet.from_message(message)
+
+
+def test_a_message_with_a_rule_that_is_none_is_a_bad_reply() -> None:
+    message = msgspec.structs.replace(kernels().to_message(), prior_var=-1.0)
+    with pytest.raises(BadReplyError, match="prior_var"):
+        KernelSet.from_message(message)
+
+
+def test_files_without_a_moderation_have_the_full_share(tmp_path: Path) -> None:
+    kernels().save(tmp_path / "k.npz")
+    with np.load(tmp_path / "k.npz") as stored:
+        arrays = {name: stored[name] for name in stored if name != "mean_moderation"}
+    np.savez(tmp_path / "early.npz", **arrays)
+    early = KernelSet.load(tmp_path / "early.npz")
+    assert early.rule == dataclasses.replace(kernels().rule, mean_moderation=1.0)
+    del arrays["prior_var"]
+    np.savez(tmp_path / "none.npz", **arrays)
+    with pytest.raises(UsageError, match="prior_var"):
+        KernelSet.load(tmp_path / "none.npz")
 
 
 def test_sets_of_one_map_join_and_sets_of_two_do_not() -> None:

@@ -241,6 +241,13 @@ def test_zero_widths_are_refused(map_: Map) -> None:
         MapMirror(asking(lambda: map_.state, spoil=spoil)).update()
 
 
+def test_a_rule_that_is_none_is_refused(map_: Map) -> None:
+    mirror = MapMirror(asking(lambda: map_.state, spoil=changed(residual_var=-1.0)))
+    with pytest.raises(BadReplyError, match="residual_var"):
+        mirror.update()
+    assert mirror.revision is None
+
+
 @pytest.mark.parametrize("name", ["epoch", "map_revision", "tile_size_m", "prior_var"])
 def test_parts_that_disagree_are_of_two_servers(map_: Map, name: str) -> None:
     def spoil(parts: list[TilesPart]) -> Iterable[TilesPart]:

@@ -134,7 +134,7 @@ def test_what_is_no_map_is_one_line_and_exit_code_two(tmp_path: Path, saved: Pat
 def test_a_saved_map_is_exported_as_it_answers(saved: Path, tmp_path: Path, run: Run) -> None:
     state = read_map(saved).state()
     assert state.tiled is not None
-    whole = KernelMap(list(state.tiled.parts.values()), **read_map(saved).record.answer_rule._asdict())
+    whole = KernelMap(list(state.tiled.parts.values()), rule=read_map(saved).record.answer_rule)
     points = np.random.default_rng(0).uniform(-6, 6, (300, 3))
 
     assert run("export", saved, "-f", "npz", "-o", tmp_path / "a.npz", "-q")[0] == 0
@@ -218,7 +218,7 @@ def test_an_octomap_comes_back_as_a_map_that_agrees(tmp_path: Path, run: Run) ->
     assert saved.record.robots == ["small-room"]
     assert saved.record.keeps_evidence
     assert saved.tiled is not None
-    answer = KernelMap(list(saved.tiled.parts.values()), **saved.record.answer_rule._asdict()).occupancy(
+    answer = KernelMap(list(saved.tiled.parts.values()), rule=saved.record.answer_rule).occupancy(
         (keys + 0.5) * 0.2
     )
     assert answer.observed.all()
@@ -237,7 +237,7 @@ def test_kernels_come_back_as_they_answer(tmp_path: Path, saved: Path, run: Run)
     assert not again.record.keeps_evidence
     points = np.random.default_rng(1).uniform(-6, 6, (300, 3))
     kernels = ClientKernels.load(tmp_path / "a.npz")
-    found = KernelMap(list(again.tiled.parts.values()), **again.record.answer_rule._asdict())
+    found = KernelMap(list(again.tiled.parts.values()), rule=again.record.answer_rule)
     np.testing.assert_allclose(found.occupancy(points).mean, kernels.occupancy(points).mean, atol=1e-4)
     assert "profile paper" in run("info", tmp_path / "a.map")[1]
     paper = MappingService(settings=MappingSettings.of_profile("paper"), threads=1)

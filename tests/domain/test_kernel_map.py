@@ -7,7 +7,8 @@ import threading
 import numpy as np
 import pytest
 
-from potserver.domain.kernel_map import OBSERVED_ACTIVATION, PRIOR_VAR, IndexedKernels, KernelMap, as_points
+from potschemas.answers import OBSERVED_ACTIVATION, PRIOR_VAR, AnswerRule
+from potserver.domain.kernel_map import IndexedKernels, KernelMap, as_points
 from potserver.domain.types import KernelSet
 from potserver.errors import BadPointsError, ShapeError
 
@@ -93,7 +94,7 @@ def test_the_answer_says_what_is_known() -> None:
 
 
 def test_unknown_is_as_uncertain_as_it_is_told() -> None:
-    kernels = KernelMap.from_arrays(**GOOD, prior_var=7.0, observed_activation=0.9)
+    kernels = KernelMap.from_arrays(**GOOD, rule=AnswerRule(prior_var=7.0, observed_activation=0.9))
     answer = kernels.occupancy([[0.0, 0.9, 0.0], [0.0, 0.0, 0.0]])
     np.testing.assert_array_equal(answer.observed, [False, True])
     assert answer.latent_var[0] == np.float32(7.0)

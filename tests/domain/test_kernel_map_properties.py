@@ -6,7 +6,8 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from potserver.domain.kernel_map import OBSERVED_ACTIVATION, KernelMap
+from potschemas.answers import OBSERVED_ACTIVATION
+from potserver.domain.kernel_map import KernelMap
 
 SEEDS = st.integers(0, 2**31)
 CLOSE = 1.5e-4  # of a probability: twice the budget of what may be cut, and float32

@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 
+from potschemas.answers import occupancy_mean
 from potserver.domain.running_scores import MODERATIONS, RunningScores
-from potserver.numerics.occupancy import predict_occupancy
 
 
 def _answers(n: int, seed: int, *, scale: float = 1.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -22,7 +22,7 @@ def _answers(n: int, seed: int, *, scale: float = 1.0) -> tuple[np.ndarray, np.n
 def test_scores_are_plain_means_while_all_points_are_new() -> None:
     latent, var, truth = _answers(500, 0)
     scores = RunningScores().with_points(latent, var, truth, 0.1)
-    p = predict_occupancy(latent.astype(float), var.astype(float), 0.1)[0]
+    p = occupancy_mean(latent.astype(float), var.astype(float), 0.1)
     assert scores.n_points == 500
     assert scores.mean_nll(0.1) == pytest.approx(-np.log(np.where(truth, p, 1 - p)).mean())
     assert scores.mean_brier == pytest.approx(((p - truth) ** 2).mean())

@@ -36,7 +36,7 @@ def _map(shift: Float64, seed: int = 0) -> TiledMap:
             MapKernels.new(kernels_at(local[1::9], 0.4, 7.0), CARRIED),
         ]
     )
-    return tiled.with_tiles(region.tiles(lower, upper), 0.05)
+    return tiled.with_tiles(region.tiles(lower, upper))
 
 
 @pytest.mark.parametrize("fine_m", [0.05, 0.2, 0.23, 0.4, 3.0, 50.0])
@@ -118,7 +118,7 @@ def test_the_next_map_shares_what_is_the_same_and_the_old_one_stays() -> None:
     tiled = _map(np.zeros(3))
     before = dict(tiled.tiles), dict(tiled.parts)
     changed = {(-2, 0, 0): tiled.tiles[(1, 1, 0)]}
-    after = tiled.with_tiles(changed, 0.05)
+    after = tiled.with_tiles(changed)
     assert (dict(tiled.tiles), dict(tiled.parts)) == before
     same = [n for n in tiled.parts if after.parts[n] is tiled.parts[n]]
     assert [n for n in tiled.parts if n not in same] == [(-1, 0, 0)]

@@ -16,12 +16,13 @@ import pytest
 import zenoh
 
 from potschemas import messages, wire
+from potschemas.answers import AnswerRule
 from potschemas.keys import MapKeys, stats_key
 from potserver.asking.service import QueryService
 from potserver.config import Settings, load_settings
 from potserver.domain.dictionary import AtomDictionary
 from potserver.domain.running_scores import RunningScores
-from potserver.domain.types import AnswerRule, KernelSet, MapUpdate, Occupancy, Scan, TileChange
+from potserver.domain.types import KernelSet, MapUpdate, Occupancy, Scan, TileChange
 from potserver.mapping.settings import MappingSettings
 from potserver.server import MapServer
 

@@ -15,11 +15,13 @@ import zenoh
 
 from potclient.kernels import KernelSet
 from potschemas import messages
+from potschemas.answers import AnswerRule
 from potschemas.keys import CONTROL_VERBS, QUERY_OPS, MapKeys, stats_key
 from potschemas.messages import ErrorCode, ReceiptStatus
 from potschemas.wire import MIME, decode, decode_array, encode, encode_array, encoding_of
 
 SERVER = "fake"
+RULE = AnswerRule(observed_activation=0.05, prior_var=50.0, residual_var=20.0)
 PART_CELLS = 64
 LIMITS = messages.Limits(
     max_cloud_bytes=8 << 20,
@@ -49,9 +51,7 @@ def kernels_of(points: np.ndarray[Any, Any], revision: int) -> KernelSet:
         gamma_rate=one,
         weight_mean=3 * one,
         weight_var=0.5 * one,
-        observed_activation=0.05,
-        prior_var=50.0,
-        residual_var=20.0,
+        rule=RULE,
         map_revision=revision,
     )
 
@@ -441,9 +441,7 @@ class FakeServer:
                 lower=None,
                 upper=None,
                 tile_size_m=8.0,
-                observed_activation=0.05,
-                prior_var=50.0,
-                residual_var=20.0,
+                **RULE.fields(),
                 limits=LIMITS,
                 started_ns=1,
             )

@@ -7,8 +7,8 @@ import dataclasses
 import numpy as np
 import pytest
 
+from potschemas.answers import PRIOR_VAR
 from potserver.domain.dictionary import AtomDictionary
-from potserver.domain.kernel_map import PRIOR_VAR
 from potserver.domain.tiles import CARRIED, COARSE, FINE, TiledMap
 from potserver.domain.types import KernelSet, Scan, yaw_pose
 from potserver.errors import SettingsError, SolverError

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import functools
+import json
 import random
 import shutil
 import sqlite3
@@ -33,6 +34,7 @@ from potserver.mapping.settings import MappingSettings
 from potserver.storage.journal import Journal
 from potserver.storage.map_file import MapFile, Origin, read_map, write_map
 from potserver.storage.map_store import JOURNAL, TILES, MapStore, MemoryOnly, Restored
+from potserver.storage.tile_codec import DIGEST_BYTES, digest_of
 
 from .test_tile_codec import assert_same
 
@@ -565,6 +567,20 @@ def test_a_scan_that_cannot_be_repeated_is_not_left_out(
         open_map(folder, dataclasses.replace(SETTINGS, min_range_m=14.0))
     assert refused.value.reason == "settings"
     assert isinstance(refused.value.__cause__, EmptyError)
+
+
+def test_a_file_whose_rule_is_none_is_damaged(tmp_path: Path) -> None:
+    path = tmp_path / "m.map"
+    write_map(path, _other_state(), Origin("default", True, {}))
+    with sqlite(path) as connection:
+        ((record,),) = connection.execute("SELECT record FROM map").fetchall()
+        content = json.loads(record[:-DIGEST_BYTES])
+        content["rule"][1] = -1.0
+        changed = json.dumps(content).encode()
+        connection.execute("UPDATE map SET record = ?", (changed + digest_of(changed),))
+    with pytest.raises(MapFileError, match="prior_var") as refused:
+        read_map(path)
+    assert refused.value.reason == "damaged"
 
 
 def test_a_map_file_is_written_whole_or_not_at_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -8,6 +8,7 @@ import numpy as np
 
 from potclient.datasets import RecordedScan
 from potclient.results import Bool, Float64
+from potschemas.answers import AnswerRule
 from potserver.domain.kernel_map import KernelMap
 from potserver.domain.types import KernelSet
 from potserver.evaluation.mappers import Mapper, Size, kernel_bytes
@@ -79,7 +80,9 @@ class GridMap(Mapper):
         )  # fmt: skip
         self._map = KernelMap(
             kernels.replace(weight_mean=solved.weights, weight_var=solved.var),
-            mean_moderation=0.0,  # the mode's own probability, as the published figures of such maps
+            rule=AnswerRule(
+                mean_moderation=0.0
+            ),  # the mode's own probability, as the published figures of such maps
             threads=self._threads,
         )
 

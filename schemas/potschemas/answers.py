@@ -1,0 +1,166 @@
+"""From sums over kernels to answers: occupancy, its variance, and their gradients. All these formulas stand here, in numpy.
+
+At a point x, with phi_m = exp(-gamma_m |x - h_m|^2), the kernels give three sums (`LatentSums`):
+
+    f = sum_m w_m phi_m        v = sum_m var_m phi_m^2        a = sum_m phi_m
+
+An `AnswerRule` makes the answer from them. With c = mean_moderation:
+
+    observed = a >= observed_activation
+    mu = f                                  latent mean; 0 where unobserved
+    s2 = v + residual_var max(0, 1 - a)     latent variance; prior_var where unobserved
+    k = 1 / sqrt(1 + c pi s2 / 8)
+    mean = sigmoid(k mu)
+    var = mean (1 - mean) (1 - 1 / sqrt(1 + pi s2 / 8))
+
+The gradients with respect to x are 0 where unobserved, and elsewhere
+
+    grad mu = grad f
+    grad s2 = grad v - residual_var grad a, without the second term where a >= 1
+    grad mean = mean (1 - mean) (k grad mu - c pi / 16 k^3 mu grad s2)
+
+Sources: mean, the moderated sigmoid of MacKay, "The evidence framework applied to classification networks", Neural Computation
+4, 1992; var, Daunizeau, "Semi-analytical approximations to statistical moments of sigmoid and softmax mappings of normal
+variables", arXiv:1703.00091, 2017; the residual variance, in the measure of the kernels' own activation, the diagonal
+correction of Snelson and Ghahramani, "Sparse Gaussian processes using pseudo-inputs", NIPS 18, 2006.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import Any, NamedTuple, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+Bool = NDArray[np.bool_]
+Float = NDArray[np.floating]
+Float64 = NDArray[np.float64]
+_Real = TypeVar("_Real", bound=np.floating)
+
+# A point whose kernels sum to less activation than this is unobserved: nothing near it was ever seen.
+OBSERVED_ACTIVATION = 0.05
+# Variance of the latent where nothing is known, log-odds^2: a standard deviation of 10, anything from sure to sure.
+PRIOR_VAR = 100.0
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class AnswerRule:
+    """What turns sums over kernels into answers. It travels with every set of kernels, so that all who have them agree.
+
+    The defaults of `residual_var` and `mean_moderation` are the paper's model.
+
+    Raises:
+        ValueError: a number is negative or not finite.
+    """
+
+    observed_activation: float = OBSERVED_ACTIVATION  # a point with less summed activation is unobserved
+    prior_var: float = PRIOR_VAR  # log-odds^2, latent variance of unobserved points
+    # log-odds^2, what the kernels cannot know: added in the measure that the activation falls short of 1, so that certainty
+    # fades with the kernels; at 0 answers grow surer with the distance from all data
+    residual_var: float = 0.0
+    # share of the latent variance that pulls the mean towards 0.5; variances are of single weights and ignore what neighbours
+    # have in common, so that 1 makes a map timid
+    mean_moderation: float = 1.0
+
+    def __post_init__(self) -> None:
+        for name, value in self.fields().items():
+            if not 0.0 <= value < math.inf:
+                raise ValueError(f"{name}: {value}, need a finite number from 0")
+            object.__setattr__(
+                self, name, float(value)
+            )  # numpy's own scalars would decide the answers' dtype
+
+    @classmethod
+    def of(cls, source: Any) -> AnswerRule:
+        """The rule that a message or a record of settings carries, in attributes of these four names.
+
+        Raises:
+            ValueError: a number is negative or not finite.
+        """
+        return cls(*(getattr(source, name) for name in RULE_FIELDS))
+
+    def fields(self) -> dict[str, float]:
+        """The four numbers by their names, as messages take them."""
+        return {name: getattr(self, name) for name in RULE_FIELDS}
+
+
+RULE_FIELDS = tuple(field.name for field in dataclasses.fields(AnswerRule))
+
+
+class LatentSums(NamedTuple):
+    """The sums over all kernels at N points, float32 or float64."""
+
+    mean: Float  # (N,) sum_m w_m phi_m, log-odds
+    var: Float  # (N,) sum_m var_m phi_m^2, log-odds^2
+    activation: Float  # (N,) sum_m phi_m
+
+
+class LatentGradients(NamedTuple):
+    """The gradients of `LatentSums` at N points, each (N, 3), per metre."""
+
+    mean: Float
+    var: Float
+    activation: Float
+
+
+class Answer(NamedTuple):
+    """What a rule makes of the sums at N points."""
+
+    mean: Float64  # (N,) P(occupied), in [0, 1]
+    var: Float64  # (N,) variance of that probability, in [0, 0.25]
+    latent_mean: Float  # (N,) log-odds, dtype of the sums
+    latent_var: Float  # (N,) log-odds^2, dtype of the sums
+    observed: Bool  # (N,) false: no kernel near; unknown, not free
+
+
+class AnswerGradients(NamedTuple):
+    """The gradients of an answer at N points; 0 where unobserved."""
+
+    mean: Float64  # (N, 3) 1/m
+    latent_mean: Float64  # (N, 3) log-odds/m
+
+
+def answer(sums: LatentSums, rule: AnswerRule) -> Answer:
+    """Occupancy at N points. Probabilities are float64: a sure one in float32 rounds to 1, an infinite log-loss if wrong."""
+    observed = sums.activation >= rule.observed_activation
+    latent_mean = np.where(observed, sums.mean, 0.0)
+    unexplained = np.maximum(1.0 - sums.activation, 0.0)
+    latent_var = np.where(observed, sums.var + rule.residual_var * unexplained, rule.prior_var)
+    mean = occupancy_mean(latent_mean, latent_var, rule.mean_moderation)
+    return Answer(mean, occupancy_var(mean, latent_var), latent_mean, latent_var, observed)
+
+
+def gradients(sums: LatentSums, slopes: LatentGradients, rule: AnswerRule) -> AnswerGradients:
+    """Gradients of `answer`'s mean and latent mean, from those of the sums."""
+    mean, _, latent_mean, latent_var, observed = answer(sums, rule)
+    # the residual variance has a slope below an activation of 1 only
+    residual = np.where(sums.activation < 1.0, rule.residual_var, 0.0)
+    var_slope = slopes.var - residual[:, None] * slopes.activation
+    k = 1.0 / _spread(latent_var, rule.mean_moderation)
+    by_var = (rule.mean_moderation * math.pi / 16.0) * (latent_mean * k**3)
+    slope = (mean * (1.0 - mean))[:, None] * (k[:, None] * slopes.mean - by_var[:, None] * var_slope)
+    known = observed[:, None]
+    return AnswerGradients(np.where(known, slope, 0.0), np.where(known, slopes.mean, 0.0).astype(np.float64))
+
+
+def occupancy_mean(latent_mean: Float, latent_var: Float, mean_moderation: float = 1.0) -> Float64:
+    """(N,) P(occupied) for a latent of (N,) mean, log-odds, and (N,) variance, log-odds^2."""
+    return sigmoid(latent_mean / _spread(latent_var, mean_moderation))
+
+
+def occupancy_var(mean: Float64, latent_var: Float) -> Float64:
+    """(N,) variance of the probability that `occupancy_mean` gave, in [0, 0.25]."""
+    return mean * (1.0 - mean) * (1.0 - 1.0 / _spread(latent_var, 1.0))
+
+
+def sigmoid(x: NDArray[_Real]) -> NDArray[_Real]:
+    """1 / (1 + exp(-x)) without overflow, in the dtype of `x`."""
+    e = np.exp(-np.abs(x))
+    positive: NDArray[_Real] = 1.0 / (1.0 + e)
+    return np.where(x >= 0, positive, e * positive)
+
+
+def _spread(latent_var: Float, moderation: float) -> Float64:
+    return np.sqrt(1.0 + (moderation * math.pi / 8.0) * latent_var.astype(np.float64))

@@ -1,0 +1,253 @@
+"""Answers from sums: bounds, limits, gradients, the rule in messages. Quadrature: tests/conformance/test_eq1_occupancy.py."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import re
+import subprocess
+import sys
+from pathlib import Path
+from types import CodeType, SimpleNamespace
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+
+from potschemas import messages
+from potschemas.answers import (
+    RULE_FIELDS,
+    AnswerRule,
+    LatentGradients,
+    LatentSums,
+    answer,
+    gradients,
+    occupancy_mean,
+    occupancy_var,
+    sigmoid,
+)
+from potschemas.examples import examples
+from potserver.mapping.pipeline import DEFAULT_RULE
+from potserver.numerics import rays
+
+Array = np.ndarray[Any, Any]
+
+MEAN, VAR = np.meshgrid(np.linspace(-60, 60, 121), np.concatenate([[0.0], np.logspace(-6, 8, 60)]))
+RULES = [
+    AnswerRule(),
+    DEFAULT_RULE,
+    AnswerRule(0.3, 7.0, 20.0, 0.25),
+    AnswerRule(0.0, 50.0, 2.0, 0.0),
+]
+
+
+def both(mean: Array, var: Array, moderation: float = 1.0) -> tuple[Array, Array]:
+    p = occupancy_mean(mean, var, moderation)
+    return p, occupancy_var(p, var)
+
+
+def sums_of(n: int, seed: int, dtype: type = np.float64) -> LatentSums:
+    rng = np.random.default_rng(seed)
+    return LatentSums(
+        rng.normal(0.0, 4.0, n).astype(dtype),
+        (10.0 ** rng.uniform(-3, 3, n)).astype(dtype),
+        rng.uniform(0.0, 2.0, n).astype(dtype),
+    )
+
+
+# --- the probability ------------------------------------------------------------------------------------------------
+
+
+def test_ranges() -> None:
+    mean, var = both(MEAN, VAR)
+    assert ((mean >= 0) & (mean <= 1)).all()
+    assert ((var >= 0) & (var <= 0.25)).all()
+    assert (var <= mean * (1 - mean) + 1e-15).all()
+
+
+def test_no_variance_is_the_plain_sigmoid() -> None:
+    mean, var = both(np.array([-2.0, 0.0, 3.0]), np.zeros(3))
+    np.testing.assert_allclose(mean, 1 / (1 + np.exp([2.0, 0.0, -3.0])))
+    np.testing.assert_array_equal(var, 0.0)
+
+
+def test_symmetric_in_the_sign_of_the_latent() -> None:
+    one, other = both(MEAN, VAR), both(-MEAN, VAR)
+    np.testing.assert_allclose(one[0], 1 - other[0], atol=1e-12)
+    np.testing.assert_allclose(one[1], other[1], atol=1e-12)
+
+
+def test_more_variance_pulls_the_mean_towards_one_half() -> None:
+    mean = occupancy_mean(MEAN, VAR)
+    assert (np.diff(np.abs(mean - 0.5), axis=0) <= 1e-12).all()
+    assert np.abs(occupancy_mean(np.array([10.0]), np.array([1e12])) - 0.5) < 1e-4
+
+
+def test_the_moderation_scales_the_variance_for_the_mean_alone() -> None:
+    np.testing.assert_allclose(occupancy_mean(MEAN, VAR, 0.25), occupancy_mean(MEAN, 0.25 * VAR))
+    np.testing.assert_allclose(occupancy_mean(MEAN, VAR, 0.0), sigmoid(MEAN))
+    mean, var = MEAN[:, 50:71], VAR[:, 50:71]  # elsewhere p rounds to 0 or 1
+    part, full = both(mean, var, 0.25), both(mean, var)
+    np.testing.assert_allclose(
+        part[1] / (part[0] * (1 - part[0])), full[1] / (full[0] * (1 - full[0])), atol=1e-9
+    )
+
+
+def test_all_uncertain_is_the_variance_of_a_coin() -> None:
+    assert both(np.zeros(1), np.array([1e12]))[1][0] == pytest.approx(0.25, abs=1e-5)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_sigmoid_never_overflows_and_keeps_its_dtype(dtype: type) -> None:
+    x = np.array([-np.inf, -1e4, -90.0, 0.0, 90.0, 1e4, np.inf], dtype)
+    s = sigmoid(x)
+    assert s.dtype == dtype
+    np.testing.assert_allclose(s, [0, 0, 0, 0.5, 1, 1, 1], atol=1e-30)
+    assert (np.diff(s) >= 0).all()
+    assert sigmoid(np.array([-80.0], dtype))[0] > 0
+
+
+# --- sums and rule ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("rule", RULES)
+def test_an_answer_is_the_rule_point_by_point(rule: AnswerRule) -> None:
+    sums = sums_of(300, 0)
+    got = answer(sums, rule)
+    for i, (f, v, a) in enumerate(zip(*sums, strict=True)):
+        known = a >= rule.observed_activation
+        mu, s2 = (f, v + rule.residual_var * max(0.0, 1.0 - a)) if known else (0.0, rule.prior_var)
+        mean = 1 / (1 + math.exp(-mu / math.sqrt(1 + rule.mean_moderation * math.pi * s2 / 8)))
+        var = mean * (1 - mean) * (1 - 1 / math.sqrt(1 + math.pi * s2 / 8))
+        np.testing.assert_allclose([column[i] for column in got], [mean, var, mu, s2, known], rtol=1e-12)
+
+
+def test_float32_sums_keep_float32_latents_and_get_float64_probabilities() -> None:
+    rule = AnswerRule(np.float64(0.05), np.float64(50), residual_var=20, mean_moderation=1)
+    got = answer(sums_of(50, 1, np.float32), rule)
+    assert got.latent_mean.dtype == got.latent_var.dtype == np.float32
+    assert got.mean.dtype == got.var.dtype == np.float64
+    assert {type(value) for value in rule.fields().values()} == {float}
+
+
+@pytest.mark.parametrize("rule", RULES)
+def test_gradients_are_the_central_differences(rule: AnswerRule) -> None:
+    """Along a line in the space of the sums: a change of x moves all three."""
+    sums, rng = sums_of(500, 2), np.random.default_rng(3)
+    slopes = LatentGradients(*rng.normal(size=(3, 500, 3)))
+    got = gradients(sums, slopes, rule)
+    # the answer has a jump where a point becomes observed, and a kink at an activation of 1
+    edges = np.stack([np.abs(sums.activation - edge) for edge in (rule.observed_activation, 1.0)])
+    smooth = (edges > 1e-3).all(axis=0)
+    assert smooth.sum() > 450
+    for axis in range(3):
+        step = LatentSums(*(1e-6 * slope[:, axis] for slope in slopes))
+        ahead, behind = (
+            answer(LatentSums(*(s + sign * d for s, d in zip(sums, step, strict=True))), rule)
+            for sign in (1, -1)
+        )
+        for slope, name in ((got.mean, "mean"), (got.latent_mean, "latent_mean")):
+            difference = (getattr(ahead, name) - getattr(behind, name)) / 2e-6
+            np.testing.assert_allclose(slope[smooth, axis], difference[smooth], rtol=1e-5, atol=1e-8)
+    assert not got.mean[~answer(sums, rule).observed].any()
+
+
+@pytest.mark.parametrize("rule", RULES)
+def test_the_compiled_copy_in_the_rays_is_the_same_answer(rule: AnswerRule) -> None:
+    sums = sums_of(2000, 4)
+    got = answer(sums, rule)
+    z = [rays.moderated(*at, rule.residual_var, rule.mean_moderation) for at in zip(*sums, strict=True)]
+    np.testing.assert_allclose(sigmoid(np.array(z))[got.observed], got.mean[got.observed], rtol=1e-12)
+
+
+# --- the formulas of the contract --------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def formulas(root: Path) -> CodeType:
+    """The Python of the README's section, to be run as it stands."""
+    section = (root / "schemas" / "README.md").read_text().partition("### From kernels to answers\n")[2]
+    blocks = re.findall(r"^```python\n(.*?)^```", section.partition("\n### ")[0], re.MULTILINE | re.DOTALL)
+    assert len(blocks) == 2
+    return compile("\n".join(blocks), "schemas/README.md", "exec")
+
+
+@pytest.mark.parametrize("rule", RULES)
+def test_the_formulas_of_the_contract_are_the_answers(formulas: CodeType, rule: AnswerRule) -> None:
+    rng, k, n = np.random.default_rng(5), 60, 250
+    kernels = {
+        "origin": np.array([400.0, -300.0, 2.0]),
+        "hinge_mean": rng.uniform(-3, 3, (k, 3)),
+        "gamma_shape": rng.uniform(1, 4, k),
+        "gamma_rate": rng.uniform(1, 4, k),
+        "weight_mean": rng.normal(0, 4, k),
+        "weight_var": rng.uniform(0.1, 9, k),
+    }
+    points = kernels["origin"] + rng.uniform(-4, 4, (n, 3))
+
+    def told(x: Array) -> SimpleNamespace:
+        names = {**kernels, **rule.fields(), "x": x}
+        exec(formulas, names)
+        return SimpleNamespace(**names)
+
+    at = [told(x) for x in points]
+    a, grad_a = np.stack([t.a for t in at]), np.stack([t.grad_a for t in at])
+    w, v = kernels["weight_mean"], kernels["weight_var"]
+    sums = LatentSums(a @ w, a**2 @ v, a.sum(axis=1))
+    slopes = LatentGradients(
+        np.einsum("k,nkd->nd", w, grad_a), np.einsum("nk,nkd->nd", 2 * v * a, grad_a), grad_a.sum(axis=1)
+    )
+    got, of_got = answer(sums, rule), gradients(sums, slopes, rule)
+    near_edge = np.abs(sums.activation[:, None] - [rule.observed_activation, 1.0]).min(axis=1) < 1e-4
+    if rule.observed_activation > 0:
+        assert (~got.observed).sum() > 5
+    assert (got.observed & (sums.activation < 1)).sum() > 50
+    assert (sums.activation > 1).sum() > 50
+    for name, values in got._asdict().items():
+        np.testing.assert_allclose([getattr(t, name) for t in at], values, rtol=1e-12)
+    np.testing.assert_allclose([t.gradient for t in at], of_got.mean, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose([t.latent_gradient for t in at], of_got.latent_mean, rtol=1e-9, atol=1e-12)
+    for axis in range(3):
+        step = 1e-6 * np.eye(3)[axis]
+        for name, slope in (("mean", of_got.mean), ("latent_mean", of_got.latent_mean)):
+            ahead, behind = (np.array([getattr(told(x + s), name) for x in points]) for s in (step, -step))
+            difference = (ahead - behind) / 2e-6
+            np.testing.assert_allclose(slope[~near_edge, axis], difference[~near_edge], rtol=1e-5, atol=1e-6)
+
+
+# --- the rule in messages ---------------------------------------------------------------------------------------------
+
+
+def test_every_message_with_a_rule_gives_and_takes_it_whole() -> None:
+    def structs(value: Any) -> Any:
+        if isinstance(value, msgspec.Struct):
+            yield value
+            for name in value.__struct_fields__:
+                yield from structs(getattr(value, name))
+
+    found = {
+        type(s): s
+        for example in examples().values()
+        for s in structs(example)
+        if "prior_var" in s.__struct_fields__
+    }
+    assert set(found) == {messages.Kernels, messages.TilesPart, messages.Info}
+    for message in found.values():
+        rule = AnswerRule.of(message)
+        assert rule.fields() == {name: getattr(message, name) for name in RULE_FIELDS}
+        other = dataclasses.replace(rule, mean_moderation=0.75)
+        assert AnswerRule.of(msgspec.structs.replace(message, **other.fields())) == other
+
+
+@pytest.mark.parametrize("name", RULE_FIELDS)
+@pytest.mark.parametrize("value", [-1e-9, math.nan, math.inf])
+def test_numbers_that_are_no_rule_are_refused(name: str, value: float) -> None:
+    with pytest.raises(ValueError, match=name):
+        AnswerRule(**{name: value})
+
+
+def test_the_formulas_load_without_the_wire() -> None:
+    code = "import sys, potschemas.answers; print(*{'msgspec', 'msgpack'} & set(sys.modules))"
+    loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert loaded.stdout.strip() == ""
