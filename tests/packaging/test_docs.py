@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import ast
-import importlib
+import importlib.util
 import itertools
 import re
 import shlex
@@ -12,11 +12,14 @@ from pathlib import Path
 from typing import NamedTuple
 
 import pytest
+from PIL import Image
 
 OURS = {"potserver", "potclient", "potschemas"}
 FENCE = re.compile(
     r"^(?P<indent> *)```(?P<language>\w*)[^\n]*\n(?P<body>.*?)^(?P=indent)```", re.MULTILINE | re.DOTALL
 )
+MACHINE_PATH = re.compile(r"(?<![\w.~<>/-])/(?:work|tmp|home|root|mnt|opt)/")
+MOST_BYTES = {"README.md": 7_000, "ARCHITECTURE.md": 12_000}
 LINK = re.compile(r"\[[^\]]*\]\(<?([^)\s>]+)>?(?:\s+\"[^\"]*\")?\)|^\[[^\]]+\]:\s*(\S+)", re.MULTILINE)
 
 
@@ -29,8 +32,14 @@ class Block(NamedTuple):
 
 
 def documents(root: Path) -> list[Path]:
-    folders = (root, root / "docs", root / "schemas", root / "benchmarks", root / "clients", root / "docker")
+    names = ("docs", "docs/decisions", "schemas", "benchmarks", "clients", "docker", ".github")
+    folders = (root, *(root / name for name in names))
     return sorted(path for folder in folders for path in folder.glob("*.md"))
+
+
+def scripts(root: Path) -> list[Path]:
+    """What draws figures and measures: documents name these by their path."""
+    return sorted(path for name in ("docs/pictures", "benchmarks") for path in (root / name).glob("*.py"))
 
 
 def blocks(text: str, language: str) -> Iterator[Block]:
@@ -99,22 +108,89 @@ def test_commands_in_the_documents_exist(
     assert not faults, "\n".join(faults)
 
 
+def import_faults(tree: ast.AST, where: str) -> list[str]:
+    """What a module takes from our packages and is not there."""
+    faults = []
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom) and node.module and node.module.partition(".")[0] in OURS:
+            module = importlib.import_module(node.module)
+            names = [alias.name for alias in node.names if not hasattr(module, alias.name)]
+            missing = [name for name in names if importlib.util.find_spec(f"{node.module}.{name}") is None]
+            faults += [f"{where}: {node.module} has no {name}" for name in missing]
+    return faults
+
+
 def test_python_in_the_documents_compiles_and_imports_what_exists(root: Path) -> None:
     faults = []
     for path in documents(root):
         for block in blocks(path.read_text(), "python"):
             where = f"{path.relative_to(root)}:{block.line}"
             try:
-                tree = ast.parse(block.body)
+                faults += import_faults(ast.parse(block.body), where)
             except SyntaxError as error:
                 faults.append(f"{where}: {error}")
-                continue
-            for node in ast.walk(tree):
-                if isinstance(node, ast.ImportFrom) and node.module and node.module.partition(".")[0] in OURS:
-                    module = importlib.import_module(node.module)
-                    missing = [alias.name for alias in node.names if not hasattr(module, alias.name)]
-                    faults += [f"{where}: {node.module} has no {name}" for name in missing]
     assert not faults, "\n".join(faults)
+
+
+def test_scripts_beside_the_documents_import_what_exists(root: Path) -> None:
+    faults = []
+    for path in scripts(root):
+        faults += import_faults(ast.parse(path.read_text()), str(path.relative_to(root)))
+    assert not faults, "\n".join(faults)
+
+
+def test_scripts_that_the_documents_name_exist(root: Path) -> None:
+    named = {
+        (path.name, found)
+        for path in documents(root)
+        for found in re.findall(r"python ((?:benchmarks|docs)/[\w/]+\.py)", path.read_text())
+    }
+    assert named
+    assert not [f"{name}: no {found}" for name, found in sorted(named) if not (root / found).is_file()]
+
+
+def test_every_figure_with_a_script_has_been_drawn(root: Path) -> None:
+    drawn = {path.stem for path in (root / "docs/pictures").iterdir() if path.suffix in (".png", ".gif")}
+    assert {path.stem for path in (root / "docs/pictures").glob("*.py")} == drawn
+
+
+def test_the_moving_picture_is_small_enough_to_load(root: Path) -> None:
+    path = root / "docs/pictures/growing_map.gif"
+    assert path.stat().st_size <= 2_000_000
+    with Image.open(path) as picture:
+        assert picture.n_frames > 5
+        assert picture.width <= 700
+
+
+@pytest.mark.parametrize(("name", "most"), MOST_BYTES.items())
+def test_first_documents_are_short(root: Path, name: str, most: int) -> None:
+    assert len((root / name).read_bytes()) <= most
+
+
+def test_every_decision_has_its_parts_and_a_line_in_the_index(root: Path) -> None:
+    folder = root / "docs/decisions"
+    index = (folder / "README.md").read_text()
+    records = sorted(path for path in folder.glob("*.md") if path.name != "README.md")
+    assert [int(path.name[:4]) for path in records] == list(range(1, len(records) + 1))
+    parts = re.compile(
+        r"# \S[^\n]*\n\nDate: \d{4}-\d\d-\d\d\n\n## Context\n\n\S.*\n## Choice\n\n\S.*\n## Evidence\n\n\S.*",
+        re.DOTALL,
+    )
+    for path in records:
+        assert re.fullmatch(r"\d{4}-[a-z0-9-]+\.md", path.name)
+        text = path.read_text()
+        assert parts.fullmatch(text), path.name
+        title = text.partition("\n")[0].removeprefix("# ")
+        assert f"| [{path.name[:4]}]({path.name}) | {title} |" in index
+
+
+def test_no_document_names_a_path_of_somebodys_machine(root: Path) -> None:
+    found = [
+        f"{path.relative_to(root)}: {match.group()}"
+        for path in [*documents(root), *scripts(root)]
+        for match in MACHINE_PATH.finditer(path.read_text())
+    ]
+    assert not found
 
 
 def test_links_in_the_documents_lead_somewhere(root: Path) -> None:

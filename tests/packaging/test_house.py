@@ -36,12 +36,75 @@ def test_every_phony_target_exists_and_every_public_one_is_explained(
     assert {"help", "venv", "demo", "test", "check", "bench", "clean"} <= explained
 
 
-def test_hooks_use_the_tools_of_the_environment(root: Path) -> None:
-    hooks = yaml.safe_load((root / ".pre-commit-config.yaml").read_text())
-    for repository in hooks["repos"]:
-        assert repository["repo"] == "local"
+def test_hooks_bring_their_own_environments_with_the_tested_versions(root: Path) -> None:
+    text = (root / ".pre-commit-config.yaml").read_text()
+    constraints = (root / "constraints.txt").read_text()
+    for repository in yaml.safe_load(text)["repos"]:
+        if repository["repo"] != "local":
+            assert re.fullmatch(r"v?\d[\w.]*", repository["rev"])
+            continue
         for hook in repository["hooks"]:
-            assert hook["entry"].startswith(".venv/bin/")
+            assert hook["language"] == "python"
+            assert hook["additional_dependencies"]
+            assert ".venv" not in hook["entry"]
+            for pin in hook["additional_dependencies"]:
+                assert "==" not in pin or re.search(rf"^{re.escape(pin)}$", constraints, re.MULTILINE), pin
+
+
+def test_workflows_call_targets_that_exist(root: Path, make_targets: set[str]) -> None:
+    called = set()
+    for path in sorted((root / ".github" / "workflows").glob("*.yml")):
+        workflow = yaml.safe_load(path.read_text())
+        assert {"name", "on", "permissions", "jobs"} <= set(workflow), path.name
+        for job in workflow["jobs"].values():
+            assert job["timeout-minutes"] <= 90
+            for step in job["steps"]:
+                assert "run" in step or re.fullmatch(r"[\w-]+/[\w-]+@v\d+", step["uses"]), step
+                called |= set(re.findall(r"\bmake (?:--?[\w-]+ )*([a-z-]+)", step.get("run", "")))
+    assert {"test", "check", "build"} <= called
+    assert called <= make_targets
+
+
+def test_workflows_test_every_python_that_the_makefile_takes(root: Path) -> None:
+    workflow = yaml.safe_load((root / ".github" / "workflows" / "tests.yml").read_text())
+    least, most = re.search(
+        r"\(3, (\d+)\) <= sys\.version_info < \(3, (\d+)\)", (root / "Makefile").read_text()
+    ).groups()
+    expected = [f"3.{minor}" for minor in range(int(least), int(most))]
+    assert workflow["jobs"]["test"]["strategy"]["matrix"]["python"] == expected
+
+
+def test_issue_forms_have_what_a_forge_needs(root: Path) -> None:
+    forms = sorted((root / ".github" / "ISSUE_TEMPLATE").glob("*.yml"))
+    assert "config.yml" in [path.name for path in forms]
+    for path in forms:
+        form = yaml.safe_load(path.read_text())
+        if path.name == "config.yml":
+            assert form["contact_links"]
+        else:
+            assert {"name", "description", "body"} <= set(form)
+            assert len({part["id"] for part in form["body"]}) == len(form["body"])
+    assert (root / ".github" / "pull_request_template.md").is_file()
+
+
+def test_the_citation_names_the_paper_and_this_version(root: Path, project: dict) -> None:
+    citation = yaml.safe_load((root / "CITATION.cff").read_text())
+    assert {"cff-version", "message", "title", "type", "authors", "version", "license"} <= set(citation)
+    assert citation["type"] == "software"
+    assert citation["version"] == __version__
+    assert citation["license"] == project["license"]
+    assert citation["repository-code"] == project["urls"]["Homepage"]
+    paper = citation["preferred-citation"]
+    assert paper["type"] == "conference-paper"
+    assert paper["title"] == "Online Domain Adaptation for Occupancy Mapping"
+    assert [author["family-names"] for author in paper["authors"]] == ["Tompkins", "Senanayake", "Ramos"]
+    assert paper["year"] == 2020
+
+
+def test_both_packages_say_where_they_are_from(root: Path, project: dict) -> None:
+    client = (root / "clients" / "pyproject.toml").read_text()
+    assert f'Homepage = "{project["urls"]["Homepage"]}"' in client
+    assert {"Homepage", "Documentation", "Issues", "Changelog"} <= set(project["urls"])
 
 
 def test_the_changelog_knows_this_version_and_what_changed_on_the_wire(root: Path) -> None:
