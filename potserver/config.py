@@ -26,7 +26,6 @@ import msgspec
 from potschemas import keys
 from potschemas.messages import MAX_PART_KERNELS
 from potserver.adapters.session import ZenohSettings
-from potserver.atoms.admission import AdmissionSettings
 from potserver.errors import SettingsError
 from potserver.limits import Limits
 from potserver.mapping.settings import MappingSettings
@@ -78,7 +77,6 @@ class AtomSettings:
 
     writable: bool = True  # whoever reaches the server may change it, as they may send clouds and clear maps
     save: bool = False  # write each change to the file `dictionary` before it is acknowledged; else a restart forgets it
-    admission: AdmissionSettings = dataclasses.field(default_factory=AdmissionSettings)
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -89,8 +87,6 @@ class StoreSettings:
         None  # a folder for all maps; none or "": in memory only. `potserver serve` has a default
     )
     fsync: bool = True  # wait for the disk with each cloud; else a power cut, though no crash of ours, takes the last ones
-    snapshot_scans: int = 50  # clouds after which the changed tiles are written and the journal begins anew
-    snapshot_bytes: int = 64 * 2**20  # of the journal, likewise
     max_saved: int = 100  # copies with a name (`potclient map save NAME`); one more is refused
 
 
@@ -327,8 +323,6 @@ def _check(s: Settings) -> None:
                 continue
             least = 0 if field.name in ("wait_s", "retry_after_s") else 1e-9
             need(f"{table}.{field.name}", math.isfinite(value) and value >= least, "a positive number")
-    need("store.snapshot_scans", s.store.snapshot_scans > 0, "at least 1")
-    need("store.snapshot_bytes", s.store.snapshot_bytes > 0, "at least 1")
     need("store.max_saved", s.store.max_saved >= 0, "at least 0")
     need("seed", s.seed >= 0, "at least 0")
     need("threads", s.threads is None or s.threads > 0, "at least 1")
@@ -369,3 +363,30 @@ def _toml_value(value: Any) -> str:
     if isinstance(value, list):
         return "[" + ", ".join(_toml_value(v) for v in value) + "]"
     return json.dumps(value) if isinstance(value, str) else repr(value)
+
+
+class Leaf(typing.NamedTuple):
+    """One setting, for people."""
+
+    path: str  # dotted
+    value: Any  # plain: str, number, bool, list, dict or None
+    default: Any
+    type_text: str
+    text: str  # one line; empty where there is none
+
+
+def describe(settings: Settings) -> list[Leaf]:
+    """All settings, table by table, in the order of the records."""
+
+    def leaves(record: Any, tree: Mapping[str, Any], default: Mapping[str, Any], prefix: str) -> list[Leaf]:
+        found: list[Leaf] = []
+        for key, kind in _types(record).items():
+            path = f"{prefix}{key}"
+            if dataclasses.is_dataclass(kind):
+                found += leaves(kind, tree[key], default[key], f"{path}.")
+            else:
+                name = kind.__name__ if isinstance(kind, type) else str(kind)
+                found.append(Leaf(path, tree[key], default[key], name.replace("typing.", ""), ""))
+        return found
+
+    return leaves(Settings, as_tree(settings), as_tree(Settings()), "")

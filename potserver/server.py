@@ -252,8 +252,6 @@ class MapServer:
             keeps_evidence=mapper.settings.refine,
             health=self.health,
             fsync=s.fsync,
-            snapshot_scans=s.snapshot_scans,
-            snapshot_bytes=s.snapshot_bytes,
             max_saved=s.max_saved,
         )
         self._stores[map_id] = store
@@ -496,7 +494,6 @@ def _atom_store(mappers: list[Mapper], settings: Settings) -> AtomStore:
     return AtomStore(
         mappers[0].dictionary,
         use,
-        settings=settings.atoms.admission,
         writable=settings.atoms.writable,
         file=Path(str(settings.dictionary)) if is_saved else None,
         threads=settings.threads or default_threads(),
