@@ -9,12 +9,10 @@ import numpy as np
 
 from potclient.datasets import RecordedScan
 from potclient.results import Bool, Float64
-from potserver.atoms.build.scan_task import to_scan
-from potserver.domain.dictionary import AtomDictionary
 from potserver.domain.kernel_map import KernelMap
 from potserver.domain.types import KernelSet
 from potserver.mapping.service import MappingService
-from potserver.mapping.settings import MappingSettings
+from potserver.recordings import to_scan
 
 _NUMBERS_A_KERNEL = 10  # position, its variances, gamma's shape and rate, the weight and its variance
 
@@ -66,16 +64,11 @@ class ServiceMap(Mapper):
 
     Args:
         name: Of the row.
-        settings: Of the pipeline.
-        dictionary: The atoms.
-        threads: Threads that integrating one scan may use.
+        service: An empty one.
     """
 
-    def __init__(
-        self, name: str, settings: MappingSettings, dictionary: AtomDictionary, *, threads: int
-    ) -> None:
-        self.name = name
-        self._service = MappingService(dictionary, settings, threads=threads)
+    def __init__(self, name: str, service: MappingService) -> None:
+        self.name, self._service = name, service
         self._n_scans = 0
 
     def warm_up(self, *, planar: bool) -> None:

@@ -11,10 +11,11 @@ import pytest
 
 from potclient.datasets import RecordedScan, Recording, open_dataset
 from potclient.holdout import HoldOut
-from potserver import AtomDictionary, MappingSettings, cli
-from potserver.commands.eval import to_markdown, variants
+from potserver import AtomDictionary, MappingService, MappingSettings, cli
+from potserver.commands.eval import to_markdown
 from potserver.domain.kernel_map import KernelMap
 from potserver.errors import EmptyError
+from potserver.evaluation.ablations import ABLATIONS, build_map, label_of
 from potserver.evaluation.mappers import Mapper, ServiceMap, Size, kernel_bytes
 from potserver.evaluation.protocol import evaluate
 
@@ -188,20 +189,29 @@ def test_towns_are_asked_about_their_truth() -> None:
         assert metrics.n > 30
 
 
-def test_ablations_differ_from_the_map_in_what_their_names_say() -> None:
-    found = variants(MappingSettings(n_sectors=4), ablations=True)
-    assert list(found) == ["default", "POT, not refined", "RePOT, transported prior", "RePOT, flat prior"]
+@pytest.mark.parametrize("profile", ["default", "paper"])
+def test_ablations_differ_from_the_map_in_what_their_names_say(profile: str) -> None:
+    asked = dataclasses.replace(MappingSettings.of_profile(profile), n_sectors=4)
+    found = {name: build_map(name, AtomDictionary(), asked, threads=1).settings for name in ABLATIONS}
+    assert list(found) == ["POT, not refined", "RePOT, transported prior", "RePOT, flat prior"]
     assert all(settings.n_sectors == 4 for settings in found.values())
     assert not found["POT, not refined"].refine
     carried, flat = found["RePOT, transported prior"], found["RePOT, flat prior"]
+    assert carried.refine
     assert carried.carry_into_map
     assert carried.borrow_weights
     assert dataclasses.replace(flat, borrow_weights=True) == carried
-    assert list(variants(MappingSettings(), ablations=False)) == ["default"]
+    assert build_map(None, AtomDictionary(), asked, threads=1).settings == asked
+
+
+def test_a_label_says_what_ran() -> None:
+    assert label_of(MappingSettings()) == "default"
+    assert label_of(MappingSettings.of_profile("paper")) == "paper"
+    assert label_of(MappingSettings(n_sectors=4, max_range_m=9.0)) == "default, max_range_m=9.0, n_sectors=4"
 
 
 def test_our_map_is_the_services() -> None:
-    service = ServiceMap("ours", MappingSettings(), AtomDictionary(), threads=1)
+    service = ServiceMap("ours", MappingService(AtomDictionary(), MappingSettings(), threads=1))
     timings = service.integrate(Wall()[0])
     assert timings.keys() >= {"label", "fuse"}
     size = service.size()

@@ -18,12 +18,13 @@ from potclient.errors import DatasetError
 from potclient.holdout import HoldOut, LabelledPoints
 from potclient.metrics import Metrics, score
 from potschemas import __version__
-from potserver.atoms.build.recipe import Quality, Reader, open_recording
+from potserver.atoms.build.recipe import Quality
 from potserver.atoms.learning import LearningSettings, SectorEpoch, learn_atoms
 from potserver.domain.kernel_map import KernelMap
-from potserver.domain.types import Atom, Scan
+from potserver.domain.types import Atom
 from potserver.errors import PotserverError, SolverError
 from potserver.numerics.geometry import in_sector, rotation_z, sector_edges, yaw_of
+from potserver.recordings import Reader, open_recording, to_scan
 
 NOT_JUDGED = "too few held-out points to judge it"
 
@@ -232,16 +233,3 @@ def _written(when: str, scores: Metrics) -> dict[str, str]:
         f"{when}_nll": f"{scores.nll:.4f}",
         f"{when}_ece": f"{scores.ece:.4f}",
     }
-
-
-def to_scan(recorded: RecordedScan, seq: int) -> Scan:
-    """A recorded scan as the mapper takes it."""
-    return Scan(
-        robot_id="recording",
-        seq=seq,
-        stamp_ns=recorded.stamp_ns,
-        points=recorded.points,
-        is_return=recorded.is_return,
-        T_map_sensor=recorded.T_map_sensor,
-        is_planar=recorded.is_planar,
-    )
