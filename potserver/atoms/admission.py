@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 import re
 from enum import Enum
@@ -17,7 +18,7 @@ from potserver.numerics.scores import auc
 
 # the ids of keys and messages; an atom's id is also the name of its file
 _LEGAL_ID = re.compile(r"[a-z0-9][a-z0-9_.-]{0,62}")
-_COMPARED = 500  # points of each label that decide on a near duplicate: fewer leave too much to the choice of the points
+_COMPARED = 500  # points of each label that decide on a near duplicate; with fewer, chance decides
 
 # Bounds on an atom. The built-in ones are far inside.
 MAX_ATOMS = 1_500  # each is compared with every sector, and their list is one message
@@ -189,20 +190,16 @@ def _check_kernels(atom: Atom) -> None:
 
 
 def _check_new(atom: Atom, dictionary: AtomDictionary, min_distance_m2: float, threads: int) -> None:
-    """Refuse what the dictionary has already: the blur of the entropy is taken off, so that an equal atom is at distance 0."""
+    """Refuse what the dictionary has already. The blur of the entropy is taken off: an equal atom is at distance 0."""
     others = [
         other for other in dictionary.of_dims(atom.dims) if near_in_spread(atom, other, min_distance_m2)
     ]
     if not others:
         return
     both = [atom, *others]
-    to_others = atom_distances([atom], both, n_hits=_COMPARED, n_free=_COMPARED, threads=threads)[0]
-    own = np.array(
-        [
-            float(atom_distances([a], [a], n_hits=_COMPARED, n_free=_COMPARED, threads=threads)[0, 0])
-            for a in both
-        ]
-    )
+    compare = functools.partial(atom_distances, n_hits=_COMPARED, n_free=_COMPARED, threads=threads)
+    to_others = compare([atom], both)[0]
+    own = np.array([compare([a], [a])[0, 0] for a in both])
     distance = to_others[1:] - (own[0] + own[1:]) / 2.0
     nearest = int(np.argmin(distance))
     if distance[nearest] < min_distance_m2:

@@ -21,9 +21,7 @@ T = TypeVar("T")
 R = TypeVar("R")
 
 LOCAL_RAY = "local"
-_TASKS_A_WORKER = (
-    3  # handed out at once: enough that no worker waits for the slowest one, and few results are held
-)
+_TASKS_A_WORKER = 3  # handed out at once: no worker waits for the slowest one, and few results are held
 # one thread a task, so that sums do not depend on the machine; read by the libraries when a worker loads them
 _ONE_THREAD = {
     f"{library}_NUM_THREADS": "1" for library in ("OMP", "MKL", "OPENBLAS", "NUMBA", "VECLIB_MAXIMUM")

@@ -39,14 +39,12 @@ class RecordingRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_
     """One recording, and what differs for it from the recipe's own settings."""
 
     dataset: str  # a path, `bundled:NAME`, or anything else that `open_dataset` knows
-    name: Annotated[str, msgspec.Meta(pattern=r"^[a-z0-9][a-z0-9_.-]{0,39}$")] | None = (
-        None  # prefix of the atoms' ids; default: from the dataset
-    )
+    # prefix of the atoms' ids; default: from the dataset
+    name: Annotated[str, msgspec.Meta(pattern=r"^[a-z0-9][a-z0-9_.-]{0,39}$")] | None = None
     licence: str = "not stated"
     scans: int | str = ":"  # the first N, or START:STOP:STEP
-    window: _AtLeastOne = (
-        1  # scans, from each taken one on, that are learned together; a 2D scan alone shows little
-    )
+    # scans, from each taken one on, that are learned together; a 2D scan alone shows little
+    window: _AtLeastOne = 1
     dims: Literal[2, 3] | None = None  # what its scans must have
     max_atoms: _AtLeastOne | None = None  # kept of this recording
     tolerance_m: _NotNegative | None = None
@@ -157,16 +155,16 @@ def learning_settings(values: Mapping[str, Any]) -> LearningSettings:
 
 def located(recording: RecordingRecipe, folder: Path) -> RecordingRecipe:
     """The same recording with its relative paths, which start at the recipe's folder, made absolute."""
-    poses = recording.reader.poses
-    return msgspec.structs.replace(
-        recording,
-        dataset=recording.dataset
-        if _is_spec(recording.dataset)
-        else str((folder / recording.dataset).resolve()),
-        reader=msgspec.structs.replace(
-            recording.reader, poses=poses if poses is None else str((folder / poses).resolve())
-        ),
-    )
+
+    def at(path: str) -> str:
+        return str((folder / path).resolve())
+
+    dataset, reader = recording.dataset, recording.reader
+    if not _is_spec(dataset):
+        dataset = at(dataset)
+    if reader.poses is not None:
+        reader = msgspec.structs.replace(reader, poses=at(reader.poses))
+    return msgspec.structs.replace(recording, dataset=dataset, reader=reader)
 
 
 def _is_spec(dataset: str) -> bool:

@@ -144,7 +144,7 @@ def _opened(dataset: str, reader: Reader) -> Recording:
 
 
 def _held_out_of(recording: Recording, numbers: tuple[int, ...]) -> list[LabelledPoints]:
-    """What the held-out beams of some scans say; one that cannot be read is its own task's failure, and left out here."""
+    """What the held-out beams of some scans say. A scan that cannot be read is left out: its own task reports it."""
     found = []
     for number in numbers:
         with contextlib.suppress(DatasetError, OSError):
@@ -188,7 +188,7 @@ class SectorOf(NamedTuple):
 
 
 def _means_alone(hinge: NDArray[Any], gamma: NDArray[Any], weight: NDArray[Any]) -> KernelMap:
-    """A map that answers with the means: how much a map doubts its weights is its own affair."""
+    """A map that answers with the means of the weights, without their variances."""
     return KernelMap.from_arrays(hinge, gamma, weight, np.zeros(len(weight)))
 
 
