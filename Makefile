@@ -83,7 +83,7 @@ fix: $(READY) ## repair style and format; write the generated schemas
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 	$(BIN)/python -m potschemas.generate
-	$(BIN)/python -m potserver.config > docs/settings.md
+	$(BIN)/potserver config show --markdown > docs/settings.md
 
 bench: $(READY) ## benchmarks; table here, numbers into out/bench/bench.json
 	@mkdir -p out/bench

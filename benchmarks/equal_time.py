@@ -10,23 +10,29 @@ scans in turns, on one thread; curves are compared where they take as long as th
 from __future__ import annotations
 
 import argparse
-import dataclasses
-import json
+import functools
 import sys
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from matplotlib.figure import Figure
 from rich.console import Console
 from rich.table import Table
 
+from benchmarks.shared import keep, parser_of
 from potclient.holdout import HoldOut
-from potserver.atoms.build.recipe import Reader, open_recording
-from potserver.commands.eval import asked_scans, variants
+from potserver.commands.shared import table
 from potserver.domain.dictionary import AtomDictionary
+from potserver.evaluation.ablations import ABLATIONS, label_of
 from potserver.evaluation.mappers import ServiceMap
 from potserver.evaluation.protocol import evaluate
+from potserver.mapping.default import DefaultPipeline
+from potserver.mapping.fusion import FitEffort
+from potserver.mapping.pipeline import Method, Pipeline
+from potserver.mapping.service import MappingService
 from potserver.mapping.settings import MappingSettings
+from potserver.recordings import Reader, open_recording, scan_numbers
 
 _STEPS = (1, 2, 3, 4, 6, 8)
 _AS_SHIPPED = "as shipped"
@@ -49,12 +55,11 @@ def main() -> int:
     console = Console(width=120)
     reader = Reader(min_range_m=options.min_range, max_range_m=options.max_range)
     recording = open_recording(options.dataset, reader)
-    numbers = asked_scans(options.dataset, options.scans).numbers(len(recording))
-    dictionary = AtomDictionary.builtin()
+    numbers = scan_numbers(options.scans, len(recording))
     maps, names = [], []
-    for curve, steps, settings in _asked():
+    for curve, steps, service in _asked(AtomDictionary.builtin()):
         names.append((curve, steps))
-        maps.append(ServiceMap(f"{curve}, {steps}", settings, dictionary, threads=1))
+        maps.append(ServiceMap(f"{curve}, {steps}", service))
     evaluation = evaluate(
         options.dataset, recording, numbers, maps,
         hold_out=HoldOut(0.2), thin=options.thin, on_step=lambda step: print(step, file=sys.stderr),
@@ -67,51 +72,55 @@ def main() -> int:
     console.print(_table(points))
     for line in _at_equal_time(points):
         console.print(line)
-    if options.json:
-        Path(options.json).write_text(json.dumps([point._asdict() for point in points], indent=1))
-    if options.out:
-        _draw(points, options.dataset, options.out)
-        console.print(f"curves: {options.out}")
+    keep(options, [point._asdict() for point in points], lambda: _draw(points, options.dataset))
     return 0
 
 
 def _options() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = parser_of(__doc__, draws=True)
     parser.add_argument("dataset", metavar="DATASET")
-    parser.add_argument("--scans", metavar="FROM:TO:STEP")
+    parser.add_argument("--scans", default=":", metavar="START:STOP:STEP")
     parser.add_argument("--min-range", type=float, default=0.0, metavar="M")
     parser.add_argument("--max-range", type=float, metavar="M")
     parser.add_argument("--thin", type=int, default=1, metavar="N", help="take every Nth beam")
-    parser.add_argument("--json", metavar="FILE", help="write the numbers")
-    parser.add_argument("-o", "--out", metavar="PNG")
     return parser.parse_args()
 
 
-def _asked() -> list[tuple[str, str, MappingSettings]]:
-    """Curve, steps, and settings of each map."""
+def _asked(dictionary: AtomDictionary) -> list[tuple[str, str, MappingService]]:
+    """Curve, steps, and empty map of each."""
     found = []
-    for name, settings in variants(MappingSettings(), ablations=True).items():
-        found.append((name, _AS_SHIPPED, settings))
-        if settings.refine:
+    shipped = MappingSettings()
+    pipelines: dict[str, type[Pipeline]] = {label_of(shipped): DefaultPipeline, **ABLATIONS}
+    for name, pipeline in pipelines.items():
+        found.append(
+            (name, _AS_SHIPPED, MappingService(dictionary, shipped, threads=1, make_pipeline=pipeline))
+        )
+        if pipeline.keeps_evidence:
             for n in _STEPS:
-                # no solve is cheap: the same number of steps whatever it touches
-                fixed = dataclasses.replace(settings, newton_steps=n, cheap_values=1)
-                found.append((name, str(n), fixed))
+                # the same number of steps whatever they touch
+                method = Method(effort=FitEffort(newton_steps=n, most_newton_steps=n))
+                fixed = functools.partial(pipeline, method=method)
+                found.append(
+                    (name, str(n), MappingService(dictionary, shipped, threads=1, make_pipeline=fixed))
+                )
     return found
 
 
 def _table(points: list[Point]) -> Table:
-    table = Table(box=None, pad_edge=False, header_style="dim")
-    table.add_column("map")
-    for name in ("Newton steps", "kernels", "CPU ms/scan", "AUC", "NLL", "ECE"):
-        table.add_column(name, justify="right")
-    for p in points:
-        table.add_row(
-            p.curve, p.steps, f"{p.kernels:,}", f"{p.cpu_ms:.0f}", f"{p.auc:.4f}", f"{p.nll:.4f}", f"{p.ece:.4f}"
-        )  # fmt: skip
-    return table
+    heads = ("map", "Newton steps", "kernels", "CPU ms/scan", "AUC", "NLL", "ECE")
+    rows = [
+        (
+            p.curve,
+            p.steps,
+            f"{p.kernels:,}",
+            f"{p.cpu_ms:.0f}",
+            f"{p.auc:.4f}",
+            f"{p.nll:.4f}",
+            f"{p.ece:.4f}",
+        )
+        for p in points
+    ]
+    return table(heads, rows)
 
 
 def _at_equal_time(points: list[Point]) -> list[str]:
@@ -135,7 +144,7 @@ def _curves(points: list[Point]) -> list[tuple[str, list[float], list[float]]]:
     return found
 
 
-def _draw(points: list[Point], dataset: str, path: str) -> None:
+def _draw(points: list[Point], dataset: str) -> Figure:
     import matplotlib.pyplot as plt
 
     figure, axis = plt.subplots(figsize=(6.0, 4.0), layout="constrained")
@@ -146,7 +155,7 @@ def _draw(points: list[Point], dataset: str, path: str) -> None:
     axis.set(xlabel="processor ms a scan, median", ylabel="held-out NLL, nats", title=Path(dataset).name)
     axis.grid(alpha=0.3)
     axis.legend(frameon=False)
-    figure.savefig(path, dpi=110)
+    return figure
 
 
 if __name__ == "__main__":

@@ -12,21 +12,22 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import json
 import sys
-from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 from scipy.spatial import cKDTree
 
+from benchmarks.shared import keep, parser_of
 from potclient.datasets import RecordedScan, open_dataset
 from potclient.towns import PERIOD_S, Town, TownRecording
 from potclient.towns.solids import SolidSet
-from potserver import AtomDictionary, MappingSettings
+from potserver import AtomDictionary, MappingService, MappingSettings
+from potserver.commands.shared import table
 from potserver.evaluation.mappers import Mapper, ServiceMap
 from potserver.evaluation.peers import peer_named
 
@@ -87,11 +88,7 @@ def main() -> int:
         f"driving: {options.dataset}, {options.scans}; standing: {options.leaving}, {len(runs[_STOOD][1])} scans"
     )
     console.print(_table(report, names))
-    if options.json:
-        Path(options.json).write_text(json.dumps(report, indent=1))
-    if options.out:
-        _draw(report, names, options.out)
-        console.print(f"curves: {options.out}")
+    keep(options, report, lambda: _draw(report, names))
     return 0
 
 
@@ -141,16 +138,12 @@ def _follow(
 
 
 def _options() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = parser_of(__doc__, draws=True)
     parser.add_argument("dataset", nargs="?", default="town:terraces:dynamic:vlp16:200m:7")
     parser.add_argument("--leaving", default="town:terraces:dynamic:vlp16:200m:3", metavar="DATASET")
     parser.add_argument("--scans", default="0:160:2", metavar="START:STOP:STEP")
     parser.add_argument("--max-range", type=float, default=25.0, metavar="M")
     parser.add_argument("--threads", type=int, default=1)
-    parser.add_argument("--json", metavar="FILE", help="write the numbers")
-    parser.add_argument("-o", "--out", metavar="PNG")
     return parser.parse_args()
 
 
@@ -158,8 +151,8 @@ def _maps(options: argparse.Namespace) -> list[Mapper]:
     atoms, settings = AtomDictionary.builtin(), MappingSettings()
     never = dataclasses.replace(settings, fade_rate=0.0)
     maps: list[Mapper] = [
-        ServiceMap("ours", settings, atoms, threads=options.threads),
-        ServiceMap("ours, fade_rate 0", never, atoms, threads=options.threads),
+        ServiceMap("ours", MappingService(atoms, settings, threads=options.threads)),
+        ServiceMap("ours, fade_rate 0", MappingService(atoms, never, threads=options.threads)),
         peer_named("octomap:0.2", threads=options.threads),
     ]
     for a_map in maps:
@@ -205,24 +198,21 @@ def _seen_through(points: np.ndarray, scan: RecordedScan) -> np.ndarray:
 
 
 def _table(report: dict[str, Any], names: list[str]) -> Table:
-    table = Table(
-        box=None, pad_edge=False, header_style="dim", title="mean P(occupied) where something has left"
-    )
-    table.add_column("scans that saw through", no_wrap=True)
-    for count in _SHOWN:
-        table.add_column(str(count), justify="right")
+    rows = []
     for kind in (_PASSED, _STOOD):
         for name in names:
-            table.add_row(f"{kind}: {name}", *(_mean(report, kind, name, c) for c in _SHOWN))
-        table.add_row(f"{kind}: places", *(f"{report['places'][kind][c]:,}" for c in _SHOWN))
-    return table
+            rows.append([f"{kind}: {name}", *(_mean(report, kind, name, c) for c in _SHOWN)])
+        rows.append([f"{kind}: places", *(f"{report['places'][kind][c]:,}" for c in _SHOWN)])
+    made = table(["scans that saw through", *map(str, _SHOWN)], rows)
+    made.title = "mean P(occupied) where something has left"
+    return made
 
 
 def _mean(report: dict[str, Any], kind: str, name: str, count: int) -> str:
     return f"{report[kind][name][count]:.2f}" if report["places"][kind][count] else "-"
 
 
-def _draw(report: dict[str, Any], names: list[str], path: str) -> None:
+def _draw(report: dict[str, Any], names: list[str]) -> Figure:
     import matplotlib.pyplot as plt
 
     figure, axes = plt.subplots(1, 2, figsize=(9.0, 3.4), sharey=True, layout="constrained")
@@ -237,7 +227,7 @@ def _draw(report: dict[str, Any], names: list[str], path: str) -> None:
         axis.grid(alpha=0.3)
     axes[0].set_ylabel("mean P(occupied)")
     axes[0].legend(frameon=False)
-    figure.savefig(path, dpi=110)
+    return figure
 
 
 if __name__ == "__main__":

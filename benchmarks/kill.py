@@ -13,11 +13,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import dataclasses
-import json
-import os
-import queue
 import signal
-import subprocess
 import sys
 import tempfile
 import threading
@@ -27,6 +23,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from benchmarks.server_process import START_S, ServerProcess
 from potclient import MapClient, PotclientError
 from potserver.adapters import codec
 from potserver.domain.map_state import MapState
@@ -37,7 +34,6 @@ from potserver.storage.journal import Journal
 from potserver.storage.map_file import read_map
 from potserver.storage.map_store import JOURNAL, TILES
 
-START_S = 600.0  # the first start on a machine compiles
 _BASE_NS = 1_700_000_000_000_000_000
 _MAPPING = {"max_range_m": 15.0, "beams_per_scan": 400}
 _PUBLISHERS, _ASKER = ("r1", "r2"), "r3"
@@ -84,61 +80,19 @@ def make_scan(scan_id: ScanId) -> Scan:
     )
 
 
-class Server:
-    """`potserver serve`, whose JSON log is read as it comes."""
-
-    def __init__(self, store: Path, *, snapshot_scans: int) -> None:
-        environ = {k: v for k, v in os.environ.items() if not k.startswith(("POTSERVER_", "ZENOH_"))}
-        sets = [f"mapping.{key}={value}" for key, value in _MAPPING.items()]
-        flags = [f"--set={value}" for value in (*sets, f"store.snapshot_scans={snapshot_scans}")]
-        self.ready_after_s = float("nan")
-        self._begun_s = time.monotonic()
-        self.popen = subprocess.Popen(
-            [
-                sys.executable, "-m", "potserver.cli", "serve", "--store", str(store), "--listen", "tcp/127.0.0.1:0",
-                "--log-format", "json", "--threads", "1", *flags,
-            ],
-            stderr=subprocess.PIPE,
-            stdout=subprocess.DEVNULL,
-            text=True,
-            env=environ,
-        )  # fmt: skip
-        self.events: list[dict[str, Any]] = []
-        self.lines: list[str] = []
-        self._ready: queue.Queue[dict[str, Any]] = queue.Queue()
-        self._reader = threading.Thread(target=self._read, daemon=True)
-        self._reader.start()
-
-    def _read(self) -> None:
-        assert self.popen.stderr is not None
-        for line in self.popen.stderr:
-            self.lines.append(line)
-            with contextlib.suppress(ValueError):  # the last line may be cut off
-                event = json.loads(line)
-                self.events.append(event)
-                if event["event"] == "server_started":
-                    self.ready_after_s = time.monotonic() - self._begun_s
-                    self._ready.put(event)
-
-    def endpoint(self) -> str:
-        """Where it listens; waits until it does."""
-        try:
-            return str(self._ready.get(timeout=START_S)["endpoints"][0])
-        except queue.Empty:
-            raise RuntimeError("the server did not start:\n" + "".join(self.lines)) from None
-
-    def end(self, number: signal.Signals) -> int:
-        """Send a signal; the exit code, once its log is read to the end."""
-        self.popen.send_signal(number)
-        code = self.popen.wait(START_S)
-        self._reader.join(START_S)
-        assert self.popen.stderr is not None
-        self.popen.stderr.close()
-        return code
-
-    def of(self, event: str) -> list[dict[str, Any]]:
-        """All events of a name."""
-        return [e for e in self.events if e["event"] == event]
+def start(store: Path, *, snapshot_scans: int) -> ServerProcess:
+    """`potserver serve` on a store, with snapshots after so many scans, which no setting says."""
+    sets = [f"--set=mapping.{key}={value}" for key, value in _MAPPING.items()]
+    code = (
+        "import functools, sys\n"
+        "from potserver import cli, server\n"
+        f"server.MapStore = functools.partial(server.MapStore, snapshot_scans={snapshot_scans})\n"
+        "sys.exit(cli.main())"
+    )
+    return ServerProcess(
+        "serve", "--store", str(store), "--listen", "tcp/127.0.0.1:0", "--log-format", "json", "--threads", "1", *sets,
+        python=("-c", code),
+    )  # fmt: skip
 
 
 class Load:
@@ -219,7 +173,7 @@ def run(
         kills: How often.
         seed: Of the moments.
         longest_s: Of the time under load before a kill.
-        snapshot_scans: The server's setting; few, so that kills meet snapshots.
+        snapshot_scans: Scans after which the server writes a snapshot: few, so that kills meet snapshots.
         show: Print progress.
     """
     rng = np.random.default_rng(seed)
@@ -228,16 +182,16 @@ def run(
     order: list[ScanId] = []
     acknowledged: set[ScanId] = set()
     while report.kills < kills:
-        server = Server(store, snapshot_scans=snapshot_scans)
+        begun_s = time.monotonic()
+        server = start(store, snapshot_scans=snapshot_scans)
         if report.kills and rng.random() < 0.2:  # on its way up, in the middle of a replay perhaps
             time.sleep(rng.uniform(0.0, 1.2 * float(np.median(report.restarts_s))))
             report.kills_while_starting += not server.of("server_started")
         else:
-            load = Load(server.endpoint(), next_seq)
+            load = Load(_ready(server, begun_s, report), next_seq)
             if rng.random() < 0.75:
                 load.wait_for_the_first()
             time.sleep(rng.uniform(0.0, longest_s))
-            _note_start(server, report)
             server.end(signal.SIGKILL)
             load.close()
             acknowledged |= load.acknowledged
@@ -252,9 +206,9 @@ def run(
                 end="" if report.kills < kills else "\n",
                 flush=True,
             )
-    server = Server(store, snapshot_scans=snapshot_scans)
-    endpoint = server.endpoint()
-    _note_start(server, report)
+    begun_s = time.monotonic()
+    server = start(store, snapshot_scans=snapshot_scans)
+    endpoint = _ready(server, begun_s, report)
     with MapClient(endpoint, timeout_s=20.0) as client:
         n_scans = client.info().n_scans
         load = Load(endpoint, next_seq)  # it goes on as before
@@ -276,18 +230,21 @@ def run(
     return report
 
 
-def _note_start(server: Server, report: Report) -> None:
-    (started,) = server.of("map_restored")
-    report.restarts_s.append(server.ready_after_s)
-    report.replays_ms.append(started["elapsed_ms"])
-    report.n_replayed.append(started["n_replayed"])
+def _ready(server: ServerProcess, begun_s: float, report: Report) -> str:
+    """Wait until it listens; returns where, and notes how long that took."""
+    endpoint: str = server.event("server_started")["endpoints"][0]
+    report.restarts_s.append(time.monotonic() - begun_s)
+    (restored,) = server.of("map_restored")
+    report.replays_ms.append(restored["elapsed_ms"])
+    report.n_replayed.append(restored["n_replayed"])
+    return endpoint
 
 
-def _integrated(server: Server) -> list[ScanId]:
+def _integrated(server: ServerProcess) -> list[ScanId]:
     return [ScanId(e["robot_id"], e["seq"]) for e in server.of("scan_integrated")]
 
 
-def _follow(server: Server, store: Path, order: list[ScanId], report: Report) -> None:
+def _follow(server: ServerProcess, store: Path, order: list[ScanId], report: Report) -> None:
     """Add what one life of the server has integrated: what it logged, and a scan that it had no time to log."""
     report.snapshots += len(server.of("snapshot_written"))
     order.extend(_integrated(server))

@@ -11,24 +11,25 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import json
 import sys
 import time
-from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
+from benchmarks.shared import keep, parser_of
 from potclient.datasets import RecordedScan
 from potclient.holdout import HoldOut, LabelledPoints
 from potclient.metrics import score
 from potclient.towns import PERIOD_S, SENSORS, Town, TownRecording
 from potclient.towns.streets import Drive
 from potserver import MappingService, MappingSettings
-from potserver.atoms.build.scan_task import to_scan
+from potserver.commands.shared import table
+from potserver.recordings import to_scan
 
 _LOOP_M = 200.0
 _SEARCHED = range(-12, 12)  # cells, for the block whose loop is nearest to that length
@@ -71,18 +72,12 @@ def main() -> int:
     console.print(_table(laps))
     for line in _verdict(laps):
         console.print(line)
-    if options.json:
-        Path(options.json).write_text(json.dumps(laps, indent=1))
-    if options.out:
-        _draw(laps, options.out)
-        console.print(f"curves: {options.out}")
+    keep(options, laps, lambda: _draw(laps))
     return 0
 
 
 def _options() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = parser_of(__doc__, draws=True)
     parser.add_argument("--style", default="terraces")
     parser.add_argument("--seed", type=int, default=7)
     parser.add_argument("--laps", type=int, default=20)
@@ -92,8 +87,6 @@ def _options() -> argparse.Namespace:
     )
     parser.add_argument("--max-range", type=float, default=25.0, metavar="M")
     parser.add_argument("--threads", type=int, default=1)
-    parser.add_argument("--json", metavar="FILE", help="write the numbers")
-    parser.add_argument("-o", "--out", metavar="PNG")
     return parser.parse_args()
 
 
@@ -153,28 +146,17 @@ def _bytes_of(parts: list[Any]) -> int:
 
 
 def _table(laps: list[dict[str, Any]]) -> Table:
-    table = Table(box=None, pad_edge=False, header_style="dim")
-    for name in (
-        "lap",
-        "kernels",
-        "their MB",
-        "evidence MB",
-        "CPU ms/scan",
-        "95 %",
-        "ACC",
-        "AUC",
-        "NLL",
-        "ECE",
-    ):
-        table.add_column(name, justify="right")
-    for k, lap in enumerate(laps):
-        table.add_row(
+    heads = ("lap", "kernels", "their MB", "evidence MB", "CPU ms/scan", "95 %", "ACC", "AUC", "NLL", "ECE")
+    rows = [
+        (
             str(k + 1), f"{lap['kernels']:,}", f"{lap['kernel_bytes'] / 1e6:.2f}",
             f"{lap['evidence_bytes'] / 1e6:.2f}", f"{np.median(lap['cpu_ms']):.0f}",
             f"{np.quantile(lap['cpu_ms'], 0.95):.0f}", f"{lap['accuracy']:.4f}", f"{lap['auc']:.5f}", f"{lap['nll']:.4f}",
             f"{lap['ece']:.4f}",
-        )  # fmt: skip
-    return table
+        )
+        for k, lap in enumerate(laps)
+    ]  # fmt: skip
+    return table(heads, rows, left=())
 
 
 def _verdict(laps: list[dict[str, Any]]) -> list[str]:
@@ -199,7 +181,7 @@ def _verdict(laps: list[dict[str, Any]]) -> list[str]:
     return lines
 
 
-def _draw(laps: list[dict[str, Any]], path: str) -> None:
+def _draw(laps: list[dict[str, Any]]) -> Figure:
     import matplotlib.pyplot as plt
 
     figure, axes = plt.subplots(1, 4, figsize=(14.0, 3.2), layout="constrained")
@@ -224,7 +206,7 @@ def _draw(laps: list[dict[str, Any]], path: str) -> None:
         axis.legend(frameon=False)
     for axis in axes[:3]:
         axis.set_ylim(bottom=0)
-    figure.savefig(path, dpi=110)
+    return figure
 
 
 if __name__ == "__main__":

@@ -18,18 +18,22 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from matplotlib.figure import Figure
 from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
+from benchmarks.shared import keep, parser_of
 from potclient.datasets import Recording, open_dataset
 from potclient.holdout import HoldOut, LabelledPoints
 from potclient.metrics import Metrics, score
-from potserver.atoms.build.scan_task import SectorOf, to_scan
+from potserver.atoms.build.scan_task import SectorOf
 from potserver.atoms.learning import LearningSettings, beam_weights, cut_sectors, lattice, learn_kernels
+from potserver.commands.shared import table
 from potserver.domain.kernel_map import KernelMap
 from potserver.numerics.feature_blocks import feature_blocks
 from potserver.numerics.warm_fit import warm_fit
+from potserver.recordings import to_scan
 
 _GRID_LENGTH = 0.75  # spacings
 _POINTS_PER_KERNEL = 4  # at least, for both: sectors with few points get fewer kernels
@@ -67,18 +71,12 @@ def main() -> int:
         console.print(_table(found[dataset]))
     for name in options.draw:
         found |= json.loads(Path(name).read_text())
-    if options.json:
-        Path(options.json).write_text(json.dumps(found, indent=1))
-    if options.out:
-        _draw(found, options.out)
-        console.print(f"curves: {options.out}")
+    keep(options, found, lambda: _draw(found))
     return 0
 
 
 def _options() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = parser_of(__doc__, draws=True)
     parser.add_argument("datasets", nargs="*", metavar="DATASET")
     parser.add_argument("--scans", default="0,20", help="first scans of the windows [0,20]")
     parser.add_argument("--window", type=int, default=1, help="scans learned together [1]")
@@ -88,11 +86,9 @@ def _options() -> argparse.Namespace:
     parser.add_argument(
         "--kernels", default="100,200,400,800", type=lambda text: [int(k) for k in text.split(",")]
     )
-    parser.add_argument("--json", metavar="FILE", help="write the numbers")
     parser.add_argument(
         "--draw", nargs="*", default=[], metavar="FILE", help="draw the numbers of these runs too"
     )
-    parser.add_argument("-o", "--out", metavar="PNG")
     return parser.parse_args()
 
 
@@ -190,29 +186,15 @@ def _plain(scores: Scores) -> dict[str, float]:
     return plain if later is None else plain | {"later_auc": later.auc, "later_nll": later.nll}
 
 
+_HEADS = (
+    "kernels", "grid AUC", "grid NLL", "grid ECE", "learned AUC", "learned NLL", "learned ECE", "s a sector",
+    "better than the grid: AUC", "NLL", "NLL, favoured", "NLL, twice as many", "later: grid AUC", "NLL", "learned AUC",
+    "NLL", "better: AUC", "NLL",
+)  # fmt: skip
+
+
 def _table(curves: dict) -> Table:
-    table = Table(box=None, pad_edge=False, header_style="dim")
-    for name in (
-        "kernels",
-        "grid AUC",
-        "grid NLL",
-        "grid ECE",
-        "learned AUC",
-        "learned NLL",
-        "learned ECE",
-        "s a sector",
-    ):
-        table.add_column(name, justify="right")
-    table.add_column("better than the grid: AUC", justify="right")
-    table.add_column("NLL", justify="right")
-    table.add_column("NLL, favoured", justify="right")
-    table.add_column("NLL, twice as many", justify="right")
-    table.add_column("later: grid AUC", justify="right")
-    table.add_column("NLL", justify="right")
-    table.add_column("learned AUC", justify="right")
-    table.add_column("NLL", justify="right")
-    table.add_column("better: AUC", justify="right")
-    table.add_column("NLL", justify="right")
+    lines = []
     for count, grid in curves["grid"].items():
         twice = curves["grid"].get(str(2 * int(count)))
         row = [count, *(f"{_mean(grid, key):.4f}" for key in ("auc", "nll", "ece"))]
@@ -229,8 +211,8 @@ def _table(curves: dict) -> Table:
                     f"{_mean(rows, key):.4f}" for rows in (fixed, moved) for key in ("later_auc", "later_nll")
                 ]
                 row += [f"{_share(moved, fixed, key):.0%}" for key in ("later_auc", "later_nll")]
-        table.add_row(*row)
-    return table
+        lines.append(row)
+    return table(_HEADS, lines, left=())
 
 
 def _mean(rows: list[dict[str, float]], key: str) -> float:
@@ -243,7 +225,7 @@ def _share(ours: list[dict[str, float]], theirs: list[dict[str, float]], key: st
     return float(np.mean([sign * a[key] >= sign * b[key] for a, b in zip(ours, theirs, strict=True)]))
 
 
-def _draw(found: dict, path: str) -> None:
+def _draw(found: dict) -> Figure:
     import matplotlib.pyplot as plt
 
     figure, axes = plt.subplots(
@@ -267,7 +249,7 @@ def _draw(found: dict, path: str) -> None:
         axes[0, column].set_title(Path(name).name if "/" in name else name)
         axes[1, column].set_xlabel("kernels")
     axes[0, 0].legend(frameon=False)
-    figure.savefig(path, dpi=110)
+    return figure
 
 
 if __name__ == "__main__":

@@ -10,15 +10,14 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import json
 import sys
 import time
-from pathlib import Path
 
 import numpy as np
 from rich.console import Console
 from rich.progress import track
 
+from benchmarks.shared import keep, parser_of
 from potclient import MapClient
 from potclient.datasets import open_dataset
 from potclient.holdout import HoldOut
@@ -63,15 +62,12 @@ def main() -> int:
             "mean_difference": float(off.mean()),
         }
     _print(found, options)
-    if options.json:
-        Path(options.json).write_text(json.dumps(found, indent=1) + "\n")
+    keep(options, found)
     return 0
 
 
 def _options() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = parser_of(__doc__)
     parser.add_argument("dataset", metavar="DATASET")
     parser.add_argument("--min-range", type=float, default=0.0, metavar="M")
     parser.add_argument("--max-range", type=float, default=25.0, metavar="M")
@@ -79,7 +75,6 @@ def _options() -> argparse.Namespace:
     parser.add_argument(
         "--mantissa-bits", type=int, metavar="N", help="of the weights, 2 to 23 (default: all)"
     )
-    parser.add_argument("--json", metavar="FILE", help="write the numbers")
     return parser.parse_args()
 
 

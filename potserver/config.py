@@ -11,7 +11,6 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import importlib
-import json
 import math
 import re
 import sys
@@ -83,9 +82,6 @@ class StoreSettings:
     fsync: Annotated[bool, "wait for the disk with each cloud; else a power cut may take the last ones"] = (
         True
     )
-    snapshot_scans: Annotated[
-        int, "clouds after which changed tiles are written and the journal begins anew"
-    ] = 50
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -136,7 +132,7 @@ _NOW_FIXED = {
     ),
     "poses": ("max_per_robot", "wait_s"),
     "atoms": ("admission",),
-    "store": ("snapshot_bytes", "max_saved"),
+    "store": ("snapshot_scans", "snapshot_bytes", "max_saved"),
     "mapping": (
         "free_per_beam", "match_beams", "n_sectors", "align_sectors", "keep_in_sector",
         "rank_hits", "rank_free", "rank_voxel_m", "rank_reg_m2", "rank_tolerance", "rank_iterations", "rank_score",
@@ -197,25 +193,6 @@ def as_tree(settings: Any) -> dict[str, Any]:
     return tree
 
 
-def to_toml(settings: Settings) -> str:
-    """The effective settings as a TOML file that `--settings` takes; keys without a value are comments."""
-    lines: list[str] = []
-
-    def write(tree: Mapping[str, Any], prefix: str) -> None:
-        for key, value in tree.items():
-            if value is None:
-                lines.append(f"# {key} =")
-            elif not isinstance(value, Mapping):
-                lines.append(f"{_toml_key(key)} = {_toml_value(value)}")
-        for key, value in tree.items():
-            if isinstance(value, Mapping):
-                lines.extend(["", f"[{prefix}{_toml_key(key)}]"])
-                write(value, f"{prefix}{_toml_key(key)}.")
-
-    write(as_tree(settings), "")
-    return "\n".join(lines) + "\n"
-
-
 class Leaf(NamedTuple):
     """One setting, for people."""
 
@@ -230,32 +207,6 @@ def describe(settings: Settings) -> list[Leaf]:
     """Every setting, in the order of the tree."""
     base = Settings(mapping=MappingSettings.of_profile(settings.mapping.profile))
     return list(_leaves(Settings, as_tree(settings), as_tree(base), ""))
-
-
-def settings_page() -> str:
-    """`docs/settings.md`: all settings as tables."""
-    lines = [_PAGE_HEAD]
-    table = None
-    for leaf in describe(Settings()):
-        name, _, key = leaf.path.rpartition(".")
-        if name != table:
-            table = name
-            title = f"`[{name}]`" if name else "Top level"
-            lines.append(f"\n## {title}\n\n| key | default | what it does |\n| --- | --- | --- |")
-        default = "unset" if leaf.default is None else f"`{_toml_value(leaf.default)}`"
-        lines.append(f"| `{key}` ({leaf.kind}) | {default} | {leaf.text} |")
-    paper = as_tree(MappingSettings.of_profile("paper"))
-    ours = as_tree(MappingSettings())
-    other = ", ".join(f"`{key} = {_toml_value(value)}`" for key, value in paper.items() if value != ours[key])
-    lines.append(f"\nProfile `paper` starts from {other}.")
-    return "\n".join(lines) + "\n"
-
-
-_PAGE_HEAD = """# Settings
-
-Every setting of a server. Defaults < TOML file (`--settings FILE`) < variables (`POTSERVER_LIMITS__MAX_CLOUD_BYTES=1000000`) <
-flags (`--set limits.max_cloud_bytes=1000000`). `potserver config show` prints those in force. An unknown name is an error.
-This page is generated: `make fix` writes it."""
 
 
 def _leaves(kind: Any, tree: Mapping[str, Any], base: Mapping[str, Any], prefix: str) -> Iterator[Leaf]:
@@ -415,7 +366,6 @@ def _check(s: Settings) -> None:
             if isinstance(value, bool | tuple):
                 continue
             need(f"{table}.{field.name}", math.isfinite(value) and value > 0, "a positive number")
-    need("store.snapshot_scans", s.store.snapshot_scans > 0, "at least 1")
     need("threads", s.threads is None or s.threads > 0, "at least 1")
     need("drain_timeout_s", 0 <= s.drain_timeout_s < math.inf, "a number of seconds")
     need("zenoh.mode", s.zenoh.mode in (None, "peer", "client", "router"), "peer, client or router")
@@ -426,19 +376,3 @@ def _check(s: Settings) -> None:
     )
     need("log.level", s.log.level in ("debug", "info", "warning", "error"), "debug, info, warning or error")
     need("log.format", s.log.format in ("auto", "json", "console"), "auto, json or console")
-
-
-def _toml_key(key: str) -> str:
-    return key if re.fullmatch(r"[A-Za-z0-9_-]+", key) else json.dumps(key)
-
-
-def _toml_value(value: Any) -> str:
-    if isinstance(value, bool):
-        return "true" if value else "false"
-    if isinstance(value, list):
-        return "[" + ", ".join(_toml_value(v) for v in value) + "]"
-    return json.dumps(value) if isinstance(value, str) else repr(value)
-
-
-if __name__ == "__main__":
-    sys.stdout.write(settings_page())

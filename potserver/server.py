@@ -40,7 +40,6 @@ from potserver.adapters.session import build_config, close_session, open_session
 from potserver.adapters.threads import spawn
 from potserver.adapters.writer import MapWriter
 from potserver.asking.service import QueryService
-from potserver.atoms.admission import AdmissionSettings
 from potserver.atoms.store import AtomStore
 from potserver.config import Settings, as_tree
 from potserver.domain.dictionary import AtomDictionary
@@ -253,7 +252,6 @@ class MapServer:
             keeps_evidence=mapper.keeps_evidence,
             health=self.health,
             fsync=s.fsync,
-            snapshot_scans=s.snapshot_scans,
         )
         self._stores[map_id] = store
         return store.restore(mapper).stamps
@@ -494,7 +492,6 @@ def _atom_store(mappers: list[Mapper], settings: Settings) -> AtomStore:
     return AtomStore(
         mappers[0].dictionary,
         use,
-        settings=AdmissionSettings(),
         writable=settings.atoms.writable,
         file=Path(str(settings.dictionary)) if is_saved else None,
         threads=settings.threads or default_threads(),

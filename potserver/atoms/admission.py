@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import dataclasses
+import functools
 import math
 import re
 from enum import Enum
@@ -14,11 +14,27 @@ from potserver.atoms.distance import atom_distances, near_in_spread
 from potserver.domain.dictionary import AtomDictionary
 from potserver.domain.kernel_map import KernelMap
 from potserver.domain.types import Atom, Float32, Float64
-from potserver.errors import AtomRefusedError, SettingsError
+from potserver.errors import AtomRefusedError
+from potserver.numerics.scores import auc
 
 # the ids of keys and messages; an atom's id is also the name of its file
 _LEGAL_ID = re.compile(r"[a-z0-9][a-z0-9_.-]{0,62}")
-_COMPARED = 500  # points of each label that decide on a near duplicate: fewer leave too much to the choice of the points
+_COMPARED = 500  # points of each label that decide on a near duplicate; with fewer, chance decides
+
+# Bounds on an atom. The built-in ones are far inside.
+MAX_ATOMS = 1_500  # each is compared with every sector, and their list is one message
+_MAX_POINTS = 2_000  # of each label
+_MAX_KERNELS = 4_000
+_MAX_PROVENANCE_CHARS = 4_000
+_MAX_RADIUS_M = 200.0
+_POINT_MARGIN_M = 0.1  # that points may lie outside the sector
+_KERNEL_MARGIN_M = 3.0  # that kernels may
+_MAX_ABS_WEIGHT = 500.0  # log-odds; the built-in atoms reach 58
+_MAX_WEIGHT_VAR = 1_000.0  # log-odds^2; the built-in atoms reach 199
+_MIN_LENGTH_SCALE_M = 0.05  # 1 / sqrt(2 gamma)
+_MAX_LENGTH_SCALE_M = 20.0
+_MIN_AUC = 0.9  # of the atom's own hits over its own free points; the built-in atoms have 0.958 to 1
+MIN_DISTANCE_M2 = 0.25  # to every other atom; the built-in atoms keep 2.3
 
 
 class Refusal(str, Enum):
@@ -40,61 +56,38 @@ class Refusal(str, Enum):
     DUPLICATE = "duplicate"
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class AdmissionSettings:
-    """Bounds on an atom; those that the built-in ones need are far inside."""
-
-    max_atoms: int = 1_500  # each is compared with every sector, and their list is one message
-    max_points: int = 2_000  # of each label
-    max_kernels: int = 4_000
-    max_provenance_chars: int = 4_000
-    max_radius_m: float = 200.0
-    point_margin_m: float = 0.1  # that points may lie outside the sector
-    kernel_margin_m: float = 3.0  # that kernels may
-    max_abs_weight: float = 500.0  # log-odds; the built-in atoms reach 58
-    max_weight_var: float = 1_000.0  # log-odds^2; the built-in atoms reach 199
-    min_length_scale_m: float = 0.05  # 1 / sqrt(2 gamma)
-    max_length_scale_m: float = 20.0
-    min_auc: float = (
-        0.9  # of the atom's own hits over its own free points; the built-in atoms have 0.958 to 1
-    )
-    min_distance_m2: float = 0.25  # to every other atom, squared 2-Wasserstein; the built-in atoms keep 2.3
-
-    def __post_init__(self) -> None:
-        for field in dataclasses.fields(self):
-            value = getattr(self, field.name)
-            if not (math.isfinite(value) and value >= 0):
-                raise SettingsError(f"atoms.admission.{field.name} is {value!r}, need a number of at least 0")
-
-
-@np.errstate(
-    over="ignore", divide="ignore", invalid="ignore"
-)  # wild numbers may overflow on the way to their refusal
 def admit(
-    atom: Atom, dictionary: AtomDictionary, settings: AdmissionSettings | None = None, *, threads: int = 1
+    atom: Atom,
+    dictionary: AtomDictionary,
+    *,
+    max_atoms: int = MAX_ATOMS,
+    min_distance_m2: float = MIN_DISTANCE_M2,
+    threads: int = 1,
 ) -> None:
     """Check an atom against the rules, the cheap ones first.
 
     Args:
         atom: The newcomer. Its types have checked the shapes of its arrays, and that they are finite.
         dictionary: What it would join.
-        settings: The bounds.
+        max_atoms: That a dictionary may hold.
+        min_distance_m2: That two atoms must keep, squared 2-Wasserstein distance.
         threads: Threads of the comparison with the others.
     Raises:
         AtomRefusedError: it may not join; `reason` is a `Refusal`.
     """
-    s = settings or AdmissionSettings()
-    _check_record(atom, dictionary, s)
-    _check_counts(atom, s)
-    _check_place(atom, s)
-    _check_kernels(atom, s)
-    auc = own_auc(atom)
-    if auc < s.min_auc:
-        raise _refused(
-            Refusal.UNEXPLAINED,
-            f"its kernels tell its own hits from its own free points with AUC {auc:.3f}, need {s.min_auc}: learn it again",
-        )
-    _check_new(atom, dictionary, s, threads)
+    # wild numbers may overflow on the way to their refusal
+    with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
+        _check_record(atom, dictionary, max_atoms)
+        _check_counts(atom)
+        _check_place(atom)
+        _check_kernels(atom)
+        own = own_auc(atom)
+        if own < _MIN_AUC:
+            raise _refused(
+                Refusal.UNEXPLAINED,
+                f"its kernels tell its own hits from its own free points with AUC {own:.3f}, need {_MIN_AUC}: learn it again",
+            )
+        _check_new(atom, dictionary, min_distance_m2, threads)
 
 
 def own_auc(atom: Atom) -> float:
@@ -104,12 +97,10 @@ def own_auc(atom: Atom) -> float:
     """
     rank = KernelMap(atom.kernels, rule=AnswerRule(observed_activation=1e-3), threads=1)
     hits, free = (rank.occupancy(points).latent_mean for points in (atom.hit_points, atom.free_points))
-    free = np.sort(free)
-    below = np.searchsorted(free, hits, "left") + np.searchsorted(free, hits, "right")
-    return float(below.mean() / (2 * len(free)))
+    return auc(hits, free)
 
 
-def _check_record(atom: Atom, dictionary: AtomDictionary, s: AdmissionSettings) -> None:
+def _check_record(atom: Atom, dictionary: AtomDictionary, max_atoms: int) -> None:
     if not _LEGAL_ID.fullmatch(atom.atom_id):
         raise _refused(
             Refusal.ILLEGAL_ID,
@@ -120,46 +111,46 @@ def _check_record(atom: Atom, dictionary: AtomDictionary, s: AdmissionSettings) 
             Refusal.TAKEN_ID,
             f"the dictionary has an atom {atom.atom_id!r}: remove it first, or take another id",
         )
-    if len(dictionary) >= s.max_atoms:
+    if len(dictionary) >= max_atoms:
         raise _refused(
-            Refusal.FULL, f"the dictionary holds {len(dictionary)} atoms, the limit is {s.max_atoms}"
+            Refusal.FULL, f"the dictionary holds {len(dictionary)} atoms, the limit is {max_atoms}"
         )
     n_chars = sum(len(key) + len(value) for key, value in atom.provenance.items())
-    if n_chars > s.max_provenance_chars:
+    if n_chars > _MAX_PROVENANCE_CHARS:
         raise _refused(
             Refusal.BAD_PROVENANCE,
-            f"the provenance has {n_chars} characters, the limit is {s.max_provenance_chars}",
+            f"the provenance has {n_chars} characters, the limit is {_MAX_PROVENANCE_CHARS}",
         )
-    if not (0 < atom.radius_m <= s.max_radius_m and 0 < atom.azimuth_width_rad <= 2 * math.pi + 1e-6):
+    if not (0 < atom.radius_m <= _MAX_RADIUS_M and 0 < atom.azimuth_width_rad <= 2 * math.pi + 1e-6):
         raise _refused(
             Refusal.BAD_SECTOR,
             f"the sector has a radius of {atom.radius_m:g} m and a width of {atom.azimuth_width_rad:g} rad;"
-            f" need at most {s.max_radius_m:g} m and 2 pi",
+            f" need at most {_MAX_RADIUS_M:g} m and 2 pi",
         )
 
 
-def _check_counts(atom: Atom, s: AdmissionSettings) -> None:
+def _check_counts(atom: Atom) -> None:
     for name, points in (("hits", atom.hit_points), ("free points", atom.free_points)):
         if len(points) == 0:
             raise _refused(Refusal.NO_POINTS, f"it has no {name}: an atom needs points of both labels")
-        if len(points) > s.max_points:
+        if len(points) > _MAX_POINTS:
             raise _refused(
                 Refusal.TOO_MANY_POINTS,
-                f"it has {len(points)} {name}, the limit is {s.max_points}: thin them",
+                f"it has {len(points)} {name}, the limit is {_MAX_POINTS}: thin them",
             )
     if len(atom.kernels) == 0:
         raise _refused(Refusal.NO_KERNELS, "it has no kernels: nothing could be carried")
-    if len(atom.kernels) > s.max_kernels:
+    if len(atom.kernels) > _MAX_KERNELS:
         raise _refused(
-            Refusal.TOO_MANY_KERNELS, f"it has {len(atom.kernels)} kernels, the limit is {s.max_kernels}"
+            Refusal.TOO_MANY_KERNELS, f"it has {len(atom.kernels)} kernels, the limit is {_MAX_KERNELS}"
         )
 
 
-def _check_place(atom: Atom, s: AdmissionSettings) -> None:
+def _check_place(atom: Atom) -> None:
     for refusal, name, points, margin_m in (
-        (Refusal.POINTS_OUTSIDE, "hit", atom.hit_points, s.point_margin_m),
-        (Refusal.POINTS_OUTSIDE, "free point", atom.free_points, s.point_margin_m),
-        (Refusal.KERNELS_OUTSIDE, "kernel", atom.kernels.hinge_mean, s.kernel_margin_m),
+        (Refusal.POINTS_OUTSIDE, "hit", atom.hit_points, _POINT_MARGIN_M),
+        (Refusal.POINTS_OUTSIDE, "free point", atom.free_points, _POINT_MARGIN_M),
+        (Refusal.KERNELS_OUTSIDE, "kernel", atom.kernels.hinge_mean, _KERNEL_MARGIN_M),
     ):
         outside_m = float(_outside(atom, points).max())
         if not outside_m <= margin_m:
@@ -181,15 +172,15 @@ def _outside(atom: Atom, points: Float32 | Float64) -> Float64:
     return np.maximum.reduce([reach - atom.radius_m, aside, above, np.zeros(len(x))])
 
 
-def _check_kernels(atom: Atom, s: AdmissionSettings) -> None:
+def _check_kernels(atom: Atom) -> None:
     kernels = atom.kernels
     length_scale = 1.0 / np.sqrt(2.0 * kernels.gamma.astype(np.float64))
     for name, values, low, high in (
-        ("weight", kernels.weight_mean, -s.max_abs_weight, s.max_abs_weight),
-        ("weight variance", kernels.weight_var, 1e-9, s.max_weight_var),
-        ("length scale", length_scale, s.min_length_scale_m, s.max_length_scale_m),
+        ("weight", kernels.weight_mean, -_MAX_ABS_WEIGHT, _MAX_ABS_WEIGHT),
+        ("weight variance", kernels.weight_var, 1e-9, _MAX_WEIGHT_VAR),
+        ("length scale", length_scale, _MIN_LENGTH_SCALE_M, _MAX_LENGTH_SCALE_M),
         # a position that is less sure than the kernel is wide says nothing
-        ("standard deviation of a hinge", np.sqrt(kernels.hinge_var), 0.0, s.max_length_scale_m),
+        ("standard deviation of a hinge", np.sqrt(kernels.hinge_var), 0.0, _MAX_LENGTH_SCALE_M),
     ):
         least, most = float(values.min()), float(values.max())
         if not low <= least <= most <= high:
@@ -199,28 +190,24 @@ def _check_kernels(atom: Atom, s: AdmissionSettings) -> None:
             )
 
 
-def _check_new(atom: Atom, dictionary: AtomDictionary, s: AdmissionSettings, threads: int) -> None:
-    """Refuse what the dictionary has already: the blur of the entropy is taken off, so that an equal atom is at distance 0."""
+def _check_new(atom: Atom, dictionary: AtomDictionary, min_distance_m2: float, threads: int) -> None:
+    """Refuse what the dictionary has already. The blur of the entropy is taken off: an equal atom is at distance 0."""
     others = [
-        other for other in dictionary.of_dims(atom.dims) if near_in_spread(atom, other, s.min_distance_m2)
+        other for other in dictionary.of_dims(atom.dims) if near_in_spread(atom, other, min_distance_m2)
     ]
     if not others:
         return
     both = [atom, *others]
-    to_others = atom_distances([atom], both, n_hits=_COMPARED, n_free=_COMPARED, threads=threads)[0]
-    own = np.array(
-        [
-            float(atom_distances([a], [a], n_hits=_COMPARED, n_free=_COMPARED, threads=threads)[0, 0])
-            for a in both
-        ]
-    )
+    compare = functools.partial(atom_distances, n_hits=_COMPARED, n_free=_COMPARED, threads=threads)
+    to_others = compare([atom], both)[0]
+    own = np.array([compare([a], [a])[0, 0] for a in both])
     distance = to_others[1:] - (own[0] + own[1:]) / 2.0
     nearest = int(np.argmin(distance))
-    if distance[nearest] < s.min_distance_m2:
+    if distance[nearest] < min_distance_m2:
         raise _refused(
             Refusal.DUPLICATE,
             f"it is a near duplicate of {others[nearest].atom_id!r}: squared distance {max(distance[nearest], 0.0):.3f} m^2,"
-            f" need {s.min_distance_m2:g}",
+            f" need {min_distance_m2:g}",
         )
 
 

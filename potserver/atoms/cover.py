@@ -16,7 +16,7 @@ from potserver.mapping.matching import Ranking
 from potserver.numerics.geometry import rotation_z
 
 _DISTANCE_DECIMALS = 3  # compared in these: last bits must not decide
-# points compared, of each label; with half of them, two draws of one outdoor sector are 3 m apart, with these 2 m
+# Points of each label that are compared. Two draws of one outdoor sector are 2 m apart with so many, 3 m with half of them.
 _HITS, _FREE = 200, 120
 _QUANTILES = (np.arange(16) + 0.5) / 16
 
@@ -25,9 +25,7 @@ class Cover(NamedTuple):
     """The choice among N candidates."""
 
     chosen: list[int]  # in the order of choice
-    covered_by: NDArray[
-        np.int64
-    ]  # (N,) which chosen one is within the tolerance; itself if chosen; -1 = none
+    covered_by: NDArray[np.int64]  # (N,) a chosen one within the tolerance; itself if chosen; -1 = none
     distance_m: Float64  # (N,) least distance to a chosen one that was computed; infinite if none was
 
 
@@ -42,14 +40,13 @@ def greedy_cover(
     threads: int = 1,
     on_chosen: Callable[[int, int], None] | None = None,
 ) -> Cover:
-    """Begin with the atom that says most; then, again and again, take what would be missed most, until all are near enough.
+    """Take the atom that tells most, then again and again the one that would be missed most, until all are near enough.
 
     What is missed without an atom is its content times its distance from all chosen, in units of its own tolerance: a
-    farthest-first cover with weights. A lone wall at arm's length has the lowest NLL of all and says next to nothing, since a
-    constant would have predicted it nearly as well; so atoms are weighed by what they tell, and not by how well they do.
-    Distances are those of `distances_m`. What is covered is never compared again, so the work is at most one distance for
-    each chosen atom and each candidate, and far less when many are alike. The choice does not depend on the order of the
-    candidates.
+    farthest-first cover with weights. Atoms are weighed by what they tell and not by their NLL: a lone wall at arm's length has
+    the lowest NLL and tells next to nothing, since a constant predicts it nearly as well. Distances are those of `distances_m`.
+    What is covered is not compared again: the work is at most one distance for each chosen atom and each candidate. The choice
+    does not depend on the order of the candidates.
 
     Args:
         atoms: N candidates of one number of dimensions, with different ids.
@@ -114,9 +111,8 @@ class _Compared:
     def __init__(self, atoms: Sequence[Atom], threads: int) -> None:
         self._atoms, self._threads = atoms, threads
         blur = np.array([float(self._blurred([atom], [atom])[0, 0]) for atom in atoms])
-        self._blur = np.where(
-            np.isfinite(blur), blur, 0.0
-        )  # a failed solve leaves the blur in: farther, never nearer
+        # a failed solve leaves the blur in: farther, never nearer
+        self._blur = np.where(np.isfinite(blur), blur, 0.0)
         self._profile = np.stack([_profile(atom) for atom in atoms])
 
     def lower(self, distance: Float64, one: int, others: NDArray[np.intp]) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from operator import attrgetter
 
 import numpy as np
 
@@ -11,9 +12,7 @@ from potserver.numerics.coupling import Ragged, coupling_costs
 from potserver.numerics.geometry import thin
 
 _VOXEL_M = 0.4  # points compared are thinned to one a voxel first
-_REG_M2 = (
-    2.0  # weight of the entropy: it blurs the couplings, so that an atom's distance to itself is above zero
-)
+_REG_M2 = 2.0  # weight of the entropy; it blurs the couplings: an atom's distance to itself is above zero
 
 
 def atom_distances(
@@ -33,16 +32,16 @@ def atom_distances(
     Source: paper eq. 6.
     """
     distance = np.zeros((len(a), len(b)))
-    for points_of, count in ((_hits, n_hits), (_free, n_free)):
+    for points_of, count in ((attrgetter("hit_points"), n_hits), (attrgetter("free_points"), n_free)):
         distance += _of_label(a, b, points_of, count, threads)
     return distance
 
 
 def near_in_spread(atom: Atom, other: Atom, limit_m2: float) -> bool:
-    """Whether two atoms may be nearer than a limit; false is certain, and costs microseconds.
+    """Whether two atoms may be nearer than a limit. False is certain; it costs microseconds.
 
-    The squared 2-Wasserstein distance of two sets is at least the sum, over the axes, of that of their projections, which is at
-    least the squared difference of the means plus that of the standard deviations.
+    The squared 2-Wasserstein distance of two sets is at least the sum over the axes of that of their projections. That of two
+    projections is at least the squared difference of the means plus that of the standard deviations.
     """
     bound = 0.0
     centre, other_centre = _centre(atom), _centre(other)
@@ -92,11 +91,3 @@ def _thinned(atom: Atom, points: Float32, count: int) -> Float32:
 
 def _centre(atom: Atom) -> Float64:
     return (atom.hit_points if len(atom.hit_points) else atom.free_points).mean(axis=0, dtype=np.float64)
-
-
-def _hits(atom: Atom) -> Float32:
-    return atom.hit_points
-
-
-def _free(atom: Atom) -> Float32:
-    return atom.free_points

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import itertools
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
@@ -12,13 +11,14 @@ import numpy as np
 
 from potserver.domain.types import Atom, Bool, Float32, Float64, KernelSet, Scan
 from potserver.errors import EmptyError, SettingsError, ShapeError, SolverError
+from potserver.mapping.sectors import SectorCut, sector_frames
 from potserver.numerics.abhm import AbhmEpoch, AbhmPosterior, AbhmSettings, fit_abhm
 from potserver.numerics.beams import label_beams, limit_range
-from potserver.numerics.geometry import in_sector, rotation_z, sector_edges, thin, voxel_pick, yaw_of
+from potserver.numerics.geometry import thin, voxel_pick
 
-_LENGTH_IN_SPACINGS = (
-    1.0  # length scale that a kernel starts with; narrower ones cannot bridge the gaps between rings
-)
+# length scale that a kernel starts with; narrower ones cannot bridge the gaps between rings
+_LENGTH_IN_SPACINGS = 1.0
+_KEPT_VOXEL_M = 0.2  # an atom keeps at most one point of each label in such a voxel
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -62,19 +62,16 @@ class LearningSettings:
             raise SettingsError(
                 f"need 0 <= min_range_m ({self.min_range_m}) < max_range_m ({self.max_range_m})"
             )
-
         try:
-            _ = self.abhm
+            self.abhm  # noqa: B018 - it checks the rest
         except ShapeError as error:
             raise SettingsError(str(error)) from error
 
     @property
     def abhm(self) -> AbhmSettings:
         """What the numerics need of these."""
-        names = {f.name for f in dataclasses.fields(AbhmSettings)} & {
-            f.name for f in dataclasses.fields(self)
-        }
-        return AbhmSettings(**{name: getattr(self, name) for name in names})
+        own, wanted = ({f.name for f in dataclasses.fields(kind)} for kind in (self, AbhmSettings))
+        return AbhmSettings(**{name: getattr(self, name) for name in own & wanted})
 
 
 class LabelledSector(NamedTuple):
@@ -97,12 +94,12 @@ def cut_sectors(
         points.append(labelled.points + (scan.origin - scans[0].origin))
         occupied.append(labelled.occupied)
     where, labels = np.concatenate(points), np.concatenate(occupied)
-    heading = yaw_of(scans[0].T_map_sensor)
     sectors = []
-    for number, (low, high) in enumerate(itertools.pairwise(sector_edges(settings.n_sectors))):
-        inside = in_sector(where, heading + low, heading + high, settings.max_range_m)
-        local = where[inside] @ rotation_z(heading + (low + high) / 2.0)
-        sectors.append(LabelledSector(number, float(high - low), local, labels[inside]))
+    for frame in sector_frames(scans[0].T_map_sensor, settings.max_range_m, SectorCut(settings.n_sectors)):
+        inside = frame.inside(where)
+        sectors.append(
+            LabelledSector(frame.number, frame.width_rad, frame.local(where[inside]), labels[inside])
+        )
     return sectors
 
 
@@ -152,7 +149,7 @@ def learn_atoms(
         if int(labels.sum()) < settings.min_hits:
             continue
         sector_seed = seed * settings.n_sectors + number
-        watch = functools.partial(_of_sector, number, on_epoch) if on_epoch else None
+        watch = functools.partial(_tell, on_epoch, number) if on_epoch else None
         try:
             learned = learn_kernels(
                 local, labels, settings, seed=sector_seed, threads=threads, on_epoch=watch
@@ -185,7 +182,7 @@ def learn_atoms(
     return atoms
 
 
-def _of_sector(number: int, on_epoch: Callable[[SectorEpoch], None], epoch: AbhmEpoch) -> None:
+def _tell(on_epoch: Callable[[SectorEpoch], None], number: int, epoch: AbhmEpoch) -> None:
     on_epoch(SectorEpoch(number, epoch))
 
 
@@ -262,9 +259,9 @@ def _kernel_set(learned: AbhmPosterior) -> KernelSet:
 
 def _keep(points: Float64, n: int, rng: np.random.Generator) -> Float32:
     """At most `n` points that cover the set evenly: one a voxel, then farthest-first."""
-    import open3d  # here and not above: it takes seconds to load, and only learning needs it
+    import open3d  # it takes seconds to load, and only learning needs it
 
-    picked = points[thin(points, len(points), 0.2, rng)]
+    picked = points[thin(points, len(points), _KEPT_VOXEL_M, rng)]
     if len(picked) > n:
         cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(picked))
         picked = np.asarray(cloud.farthest_point_down_sample(n).points)

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
-from potserver.atoms.admission import AdmissionSettings, admit
+from potserver.atoms.admission import admit
 from potserver.domain.dictionary import AtomDictionary
 from potserver.domain.types import Atom
 from potserver.errors import ReadOnlyError
@@ -29,7 +29,6 @@ class AtomStore:
         dictionary: AtomDictionary,
         use: Callable[[AtomDictionary], None],
         *,
-        settings: AdmissionSettings | None = None,
         writable: bool = True,
         file: Path | None = None,
         threads: int = 1,
@@ -39,13 +38,11 @@ class AtomStore:
         Args:
             dictionary: What the maps use already.
             use: Called with the new dictionary after each change.
-            settings: Which atoms may join.
             writable: Whether changes are taken at all.
             file: Where each change is written before it counts; None keeps changes in memory.
             threads: Threads that one change may use.
         """
         self._dictionary, self._use = dictionary, use
-        self._settings = settings or AdmissionSettings()
         self._writable, self._file, self._threads = writable, file, threads
         self._lock = threading.Lock()
 
@@ -63,7 +60,7 @@ class AtomStore:
         """
         self._check_writable()
         with self._lock:
-            admit(atom, self._dictionary, self._settings, threads=self._threads)
+            admit(atom, self._dictionary, threads=self._threads)
             return self._change(atom.atom_id, self._dictionary.add(atom))
 
     def remove(self, atom_id: str) -> AtomChange:

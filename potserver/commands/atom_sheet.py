@@ -90,7 +90,7 @@ def draw_sheet(atoms: Sequence[Atom], path: str | Path, *, title: str = "") -> N
     Raises:
         OSError: the file cannot be written.
     """
-    views = [_views(atom) for atom in atoms]
+    views = [views_of(atom) for atom in atoms]
     palette = _palette(atoms)
     width = _LEFT + 5 * _PANEL + 4 * _GAP + _RIGHT
     rows = [[view.height_in + _TICKS for view in of_atom] for of_atom in views]
@@ -142,7 +142,7 @@ def _header(atom: Atom) -> str:
     return "   |   ".join(parts)
 
 
-def _views(atom: Atom) -> list[_View]:
+def views_of(atom: Atom) -> list[_View]:
     planes = [(2, 0, 1)] if atom.dims == 2 else [(2, 0, 1), (1, 0, 2)]
     return [_view(atom, *plane) for plane in planes]
 
@@ -157,11 +157,11 @@ def _view(atom: Atom, across: int, right: int, up: int) -> _View:
     # very flat or very tall windows would make panels that nobody can read
     width, height = upper - lower
     grow = np.maximum([height / 1.5 - width, 0.22 * width - height], 0.0) / 2.0
-    level = 0.0 if atom.dims == 2 else _telling_level(atom, across)
+    level = 0.0 if atom.dims == 2 else slice_level(atom, across)
     return _View(across, right, up, level, np.float64(lower - grow), np.float64(upper + grow))
 
 
-def _telling_level(atom: Atom, across: int) -> float:
+def slice_level(atom: Atom, across: int) -> float:
     """m: where a slice cuts walls and free space both; one along the floor, or through the sky, would say little."""
     hits, free = atom.hit_points[_on_walls(atom.hit_points, across), across], atom.free_points[:, across]
     both = np.concatenate([hits, free])

@@ -1,4 +1,4 @@
-"""What `potserver atoms build` is told and what it shows: flags to a recipe, results to a progress bar and tables."""
+"""`potserver atoms build`: flags to a recipe, results to a progress bar and a table."""
 
 from __future__ import annotations
 
@@ -11,25 +11,88 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 from types import FrameType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-from rich.table import Table
-
-from potclient.metrics import Metrics
-from potserver.atoms.build.builder import Built, RecordingReport, build, scan_tasks
-from potserver.atoms.build.engines import Engine, in_turn, processes, ray_cluster
-from potserver.atoms.build.recipe import Recipe, builtin_recipe, parse_recipe, read_recipe, tomllib
-from potserver.atoms.build.scan_task import Progress as LearningProgress
-from potserver.atoms.build.scan_task import ScanResult
-from potserver.domain.dictionary import AtomDictionary
+from potserver.commands.shared import EXIT_FORCED, EXIT_OK, add_verb, results_console, say, table
 from potserver.errors import DictionaryError
-from potserver.numerics.threads import default_threads
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from potclient.metrics import Metrics
+    from potserver.atoms.build.builder import Built, RecordingReport
+    from potserver.atoms.build.engines import Engine
+    from potserver.atoms.build.recipe import Recipe
+    from potserver.atoms.build.scan_task import Progress, ScanResult
+
+_ABOUT = """\
+Learn a dictionary: atoms of all sectors of the recordings' scans, scored on beams that they never saw. Of the good ones
+so many are kept that each of the others has a kept atom within the tolerance.
+
+The same recipe gives the same file, however many workers there are, on one machine with the same versions."""
+
+_EXAMPLES = """\
+examples:
+  potserver atoms build /data/kitti/00 --scans 0:1000:10 --licence "CC BY-NC-SA 3.0" -o kitti.atoms
+  potserver atoms build town:terraces:1 town:suburb:2 --learner n_sectors=8 -o towns.atoms
+  potserver atoms build --recipe site.toml -o site.atoms      a recipe: see docs/dictionary.md
+  potserver atoms build --recipe site.toml -o site.atoms --ray auto
+                                                              on a Ray cluster, with recordings at the same paths"""
 
 
-def run(options: argparse.Namespace) -> AtomDictionary:
+def add(commands: Any) -> None:
+    """Add the verb."""
+    parser = add_verb(
+        commands, "build", _run, help="learn a dictionary from recordings", description=_ABOUT, epilog=_EXAMPLES
+    )  # fmt: skip
+    parser.add_argument("datasets", nargs="*", metavar="DATASET", help="recordings to learn from")
+    parser.add_argument("-o", "--out", required=True, metavar="FILE", help="dictionary file to write")
+    parser.add_argument("--recipe", metavar="FILE", help="TOML file that says what to learn from, and how")
+    parser.add_argument(
+        "--builtin", action="store_true", help="the recipe of the dictionary that the package ships"
+    )
+    parser.add_argument("--strict", action="store_true", help="end at the first scan that fails")
+    running = parser.add_argument_group("where it runs")
+    running.add_argument(
+        "--watch", action="store_true", help="in this process, with each sector's held-out scores as it learns"
+    )  # fmt: skip
+    running.add_argument("--workers", type=int, metavar="N", help="scans learned at once [all processors]")
+    running.add_argument(
+        "--ray", metavar="ADDRESS", help="on a Ray cluster; `local` starts one here (needs potserver[ray])"
+    )
+    without = parser.add_argument_group("without a recipe")
+    without.add_argument(
+        "--scans", metavar="N", help="the first N of each recording, or START:STOP:STEP [all]"
+    )
+    without.add_argument(
+        "--tolerance", type=float, metavar="M", help="of the cover, m [0.15 of the atoms' radius]"
+    )
+    without.add_argument(
+        "--max-atoms", type=int, metavar="N", help="kept in each number of dimensions [no limit]"
+    )
+    without.add_argument(
+        "--licence", metavar="TEXT", help="of the recordings, kept with the atoms [not stated]"
+    )
+    without.add_argument(
+        "--learner", action="append", default=[], metavar="KEY=VALUE", help="a setting of the learner; repeatable"
+    )  # fmt: skip
+
+
+def _run(options: argparse.Namespace) -> int:
+    from potserver.adapters.log import configure_logging
+
+    configure_logging("warning", "console")
+    try:
+        built = _build(options)
+    except KeyboardInterrupt:  # Ctrl-C or SIGTERM
+        say("potserver: interrupted, nothing was written", sys.stderr)
+        return EXIT_FORCED
+    n_kernels = sum(len(atom.kernels) for atom in built.dictionary)
+    say(f"{len(built.dictionary)} atoms, {n_kernels} kernels, written to {options.out}")
+    return EXIT_OK
+
+
+def _build(options: argparse.Namespace) -> Built:
     """Learn, choose, save.
 
     Raises:
@@ -37,18 +100,14 @@ def run(options: argparse.Namespace) -> AtomDictionary:
         SettingsError: the recipe is wrong.
         KeyboardInterrupt: at Ctrl-C or SIGTERM; nothing is written then.
     """
-    recipe, folder = _recipe(options)
+    from potserver.atoms.build.builder import build, scan_tasks
+
+    recipe, folder = recipe_of(options)
     out = Path(options.out)
     if not out.absolute().parent.is_dir():  # asked before the work, not after it
         raise DictionaryError(f"cannot write {out}: no folder {out.absolute().parent}")
-    workers = default_threads() if options.workers is None else options.workers
-    if workers < 1:
-        raise DictionaryError(f"--workers {workers}: need at least 1")
-    if options.watch and (options.workers is not None or options.ray is not None):
-        raise DictionaryError("--watch learns in this process alone: leave out --workers and --ray")
-    if options.watch:
-        workers = 1
-    console = Console(highlight=False, width=None if sys.stdout.isatty() else 120)
+    workers = _workers(options)
+    console = results_console()
     started = time.monotonic()
     tasks = scan_tasks(recipe, folder)
     console.print(
@@ -73,11 +132,30 @@ def run(options: argparse.Namespace) -> AtomDictionary:
     built.dictionary.save(out)
     _print_summary(built, console)
     console.print(f"{time.monotonic() - started:.0f} s")
-    return built.dictionary
+    return built
 
 
-def _recipe(options: argparse.Namespace) -> tuple[Recipe, Path]:
-    """The recipe that the flags name or spell out, and the folder where its relative paths start."""
+def _workers(options: argparse.Namespace) -> int:
+    from potserver.numerics.threads import default_threads
+
+    if options.watch and (options.workers is not None or options.ray is not None):
+        raise DictionaryError("--watch learns in this process alone: leave out --workers and --ray")
+    if options.watch:
+        return 1
+    workers = default_threads() if options.workers is None else options.workers
+    if workers < 1:
+        raise DictionaryError(f"--workers {workers}: need at least 1")
+    return int(workers)
+
+
+def recipe_of(options: argparse.Namespace) -> tuple[Recipe, Path]:
+    """The recipe that the flags name or spell out, and the folder where its relative paths start.
+
+    Raises:
+        DictionaryError: the flags name none, or two. SettingsError: it is wrong.
+    """
+    from potserver.atoms.build.recipe import builtin_recipe, parse_recipe, read_recipe
+
     if sum((bool(options.datasets), options.builtin, options.recipe is not None)) != 1:
         raise DictionaryError(
             "name recordings to learn from, or --recipe FILE, or --builtin, and not two of them"
@@ -85,9 +163,9 @@ def _recipe(options: argparse.Namespace) -> tuple[Recipe, Path]:
     stated: dict[str, Any] = {
         "tolerance_m": options.tolerance,
         "max_atoms": options.max_atoms,
-        "scans": None if options.scans is None else _int_if_it_is_one(options.scans),
+        "scans": options.scans,
         "licence": options.licence,
-        "learner": dict(_assignment(text) for text in options.learner) or None,
+        "learner": dict(map(_assignment, options.learner)) or None,
     }
     stated = {key: value for key, value in stated.items() if value is not None}
     if not options.datasets:
@@ -101,12 +179,10 @@ def _recipe(options: argparse.Namespace) -> tuple[Recipe, Path]:
     return parse_recipe(tree, "flags"), Path.cwd()
 
 
-def _int_if_it_is_one(text: str) -> int | str:
-    return int(text) if text.isdecimal() else text
-
-
 def _assignment(text: str) -> tuple[str, Any]:
     """KEY=VALUE with the value as in TOML."""
+    from potserver.atoms.build.recipe import tomllib
+
     key, _, value = text.partition("=")
     try:
         return key, tomllib.loads(f"value = {value}")["value"]
@@ -115,6 +191,8 @@ def _assignment(text: str) -> tuple[str, Any]:
 
 
 def _engine(options: argparse.Namespace, workers: int) -> contextlib.AbstractContextManager[Engine]:
+    from potserver.atoms.build.engines import in_turn, processes, ray_cluster
+
     if options.watch:
         return in_turn()
     return processes(workers) if options.ray is None else ray_cluster(options.ray, workers)
@@ -138,6 +216,8 @@ class _Shown:
     """A bar for the scans and one for the cover, and a line for every scan that fails."""
 
     def __init__(self, console: Console, n_scans: int) -> None:
+        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
         self._progress = Progress(
             TextColumn("{task.description}"),
             BarColumn(),
@@ -175,7 +255,7 @@ class _Shown:
             self._n_done += 1
             self._progress.console.print(f"{self._n_done} of {self._n_scans} scans learned, {found}")
 
-    def epoch(self, at: LearningProgress) -> None:
+    def epoch(self, at: Progress) -> None:
         scores = "no held-out points"
         if at.scores is not None:
             s = at.scores
@@ -192,28 +272,15 @@ class _Shown:
 
 
 def _print_summary(built: Built, console: Console) -> None:
-    table = Table(box=None, header_style="dim", pad_edge=False)
-    table.add_column("recording")
-    for column in (
-        "scans",
-        "failed",
-        "candidates",
-        "refused",
-        "kept",
-        "ACC",
-        "AUC",
-        "NLL",
-        "ECE",
-        "later AUC",
-        "later NLL",
-    ):
-        table.add_column(column, justify="right")
-    for report in built.reports:
-        table.add_row(
+    heads = ("recording", "scans", "failed", "candidates", "refused", "kept", *_SCORES)
+    rows = [
+        (
             report.name, str(report.n_scans), str(report.n_failed), str(report.n_candidates),
             str(report.refused.total()), str(len(report.kept)), *_scores(report),
-        )  # fmt: skip
-    console.print(table)
+        )
+        for report in built.reports
+    ]  # fmt: skip
+    console.print(table(heads, rows))
     refused: collections.Counter[str] = sum((r.refused for r in built.reports), collections.Counter())
     for reason, count in sorted(refused.items(), key=lambda item: (-item[1], item[0])):
         console.print(f"refused {count}: {reason}")
@@ -222,6 +289,9 @@ def _print_summary(built: Built, console: Console) -> None:
     console.print(
         "scores: means over the kept atoms, each on held-out beams of its own sector, of its own and of later scans"
     )
+
+
+_SCORES = ("ACC", "AUC", "NLL", "ECE", "later AUC", "later NLL")
 
 
 def _scores(report: RecordingReport) -> list[str]:
@@ -233,6 +303,5 @@ def _scores(report: RecordingReport) -> list[str]:
 
 def _mean(scores: list[Metrics], name: str) -> str:
     """The mean weighted by the number of points; "-" where there are no scores."""
-    if not scores:
-        return "-"
-    return f"{np.average([getattr(s, name) for s in scores], weights=[s.n for s in scores]):.3f}"
+    n = sum(s.n for s in scores)
+    return f"{sum(s.n * getattr(s, name) for s in scores) / n:.3f}" if n else "-"

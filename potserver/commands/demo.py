@@ -3,24 +3,19 @@
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import json
 import math
 import platform
-import sys
 import time
 from collections import Counter
-from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from rich.console import Console
-from rich.table import Table
+from numpy.typing import NDArray
 
 from potclient import MapClient
-from potclient.datasets import Recording, open_dataset
-from potclient.errors import DatasetError
+from potclient.datasets import RecordedScan, Recording, open_dataset
 from potclient.holdout import HoldOut, LabelledPoints
 from potclient.metrics import Metrics, score
 from potclient.pictures import draw_layer
@@ -28,12 +23,28 @@ from potclient.results import Receipt
 from potschemas import __version__
 from potschemas.messages import SectorReport
 from potserver import bundled
-from potserver.adapters.log import configure_logging
-from potserver.config import Settings
-from potserver.errors import PotserverError
-from potserver.mapping.settings import PROFILES, MappingSettings
-from potserver.numerics.threads import default_threads
-from potserver.server import MapServer
+from potserver.commands.shared import (
+    EXIT_OK,
+    EXIT_UNCLEAN,
+    add_verb,
+    file_errors,
+    positive_int,
+    results_console,
+    table,
+)
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+_ABOUT = (
+    "Start a server on loopback, send it recorded scans through a real Zenoh session, and score the maps."
+)
+_EXAMPLES = """\
+examples:
+  potserver demo
+  potserver demo --scans 2                  a short one
+  potserver demo --profile paper
+  potserver demo /data/kitti/00 --scans 20"""
 
 _BUNDLED = {
     bundled.STREET: "a street, two real outdoor scans, 3D",
@@ -42,20 +53,25 @@ _BUNDLED = {
 }
 _PICTURE_ABOVE_SENSOR_M = {bundled.ROOMS: 0.6}  # that sensor stands on the floor
 _PICTURE_CELLS = 400  # along the longer side
+_PICTURE_REACH_M = 30.0  # from the middle of the sensor's way
 _SPEED_POINTS = 200_000
+_SECTORS = "atom and turn of each sector (kernels, W2 in m)"
 
 
-class DemoError(PotserverError):
-    """The demo cannot go on."""
+class _Fed(NamedTuple):
+    """A scan that was sent."""
+
+    scan: RecordedScan
+    held_out: LabelledPoints
+    receipt: Receipt
 
 
-@dataclasses.dataclass(frozen=True, slots=True)
-class _MapResult:
+class _MapResult(NamedTuple):
     name: str
     receipts: list[Receipt]
     labels: LabelledPoints
-    mean: np.ndarray[Any, np.dtype[np.float32]]
-    observed: np.ndarray[Any, np.dtype[np.bool_]]
+    mean: NDArray[np.float32]
+    observed: NDArray[np.bool_]
     scores: Metrics
     kernels: int
     queries_per_s: float
@@ -65,31 +81,38 @@ class _MapResult:
         return [receipt.message.integrate_ms for receipt in self.receipts]
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Entry point of `potserver demo`; 0 when every scan was accepted and all files are written."""
-    options = _parser().parse_args(arguments)
-    console = Console(highlight=False, width=None if sys.stdout.isatty() else 120)
-    out = Path(options.out)
-    out.mkdir(parents=True, exist_ok=True)
-    configure_logging("warning", "console")
-    try:
-        recordings = _recordings(options)
-    except DatasetError as error:
-        raise DemoError(str(error)) from error
-    maps = tuple(recordings)
-    settings = Settings(server_id="demo", maps=maps, mapping=MappingSettings.of_profile(options.profile))
-    console.print(
-        f"[bold]potserver {__version__} demo[/bold]: a map server on loopback, and a robot that sends it "
-        f"{sum(map(len, recordings.values()))} scans over Zenoh.\n"
-        f"A fifth of each scan's beams is held back; at the end the maps are asked about those. Profile: {options.profile}.\n"
-        + (
-            ""
-            if options.datasets
-            else "The built-in atoms were learned in made-up towns, and some on other beams of the rooms.\n"
-        )
-        + "carried: kernels that the map took from transported atoms; placed: kernels added where those explain nothing;\n"
-        "W2: root of the transport cost under the entropic plan, hits plus free points (never 0, the blur counts)."
+def add(commands: Any) -> None:
+    """Add the verb."""
+    parser = add_verb(
+        commands, "demo", _run, help="map recorded scans through a real server, and score the maps",
+        description=_ABOUT, epilog=_EXAMPLES,
+    )  # fmt: skip
+    parser.add_argument(
+        "datasets", nargs="*", metavar="DATASET", help="recordings to map in place of the bundled ones"
     )
+    parser.add_argument("--profile", default="default", metavar="NAME", help="mapping profile [default]")
+    parser.add_argument(
+        "--scans", type=positive_int, metavar="N", help="at most this many scans of each recording"
+    )
+    parser.add_argument("--out", default="out/demo", metavar="FOLDER", help="where results go [out/demo]")
+
+
+def _run(options: argparse.Namespace) -> int:
+    """Map and score; EXIT_OK when every scan was accepted and all files are written."""
+    from potserver.adapters.log import configure_logging
+    from potserver.config import Settings
+    from potserver.mapping.settings import MappingSettings
+    from potserver.server import MapServer
+
+    console = results_console()
+    configure_logging("warning", "console")
+    recordings = _recordings(options)
+    mapping = MappingSettings.of_profile(options.profile)
+    settings = Settings(server_id="demo", maps=tuple(recordings), mapping=mapping)
+    out = Path(options.out)
+    with file_errors(f"make {out}"):
+        out.mkdir(parents=True, exist_ok=True)
+    _introduce(options, recordings, console)
     started = time.perf_counter()
     with console.status("starting the server (the first time, this compiles the numerics: half a minute)"):
         server = MapServer(settings, listen="tcp/127.0.0.1:0")
@@ -104,28 +127,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     summary = _summary(results, options.profile, time.perf_counter() - started)
     (out / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
     _print_totals(summary, console)
-    console.print(
-        f"\nresults: {out}/summary.json; pictures: {', '.join(f'{out}/{r.name}.png' for r in results)}"
-    )
-    return 0 if summary["receipts_accepted"] == summary["scans"] else 1
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="potserver demo",
-        description="Start a server on loopback, send it recorded scans through a real Zenoh session, and score the maps.",
-        epilog="examples:\n  potserver demo\n  potserver demo --profile paper\n  potserver demo /data/kitti/00 --scans 20",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    parser.add_argument(
-        "datasets", nargs="*", metavar="DATASET", help="recordings to map in place of the bundled ones"
-    )
-    parser.add_argument(
-        "--profile", choices=sorted(PROFILES), default="default", help="mapping profile [default]"
-    )
-    parser.add_argument("--scans", type=int, metavar="N", help="at most this many scans of each recording")
-    parser.add_argument("--out", default="out/demo", metavar="FOLDER", help="where results go [out/demo]")
-    return parser
+    pictures = ", ".join(f"{out}/{result.name}.png" for result in results)
+    console.print(f"\nresults: {out}/summary.json; pictures: {pictures}")
+    return EXIT_OK if summary["receipts_accepted"] == summary["scans"] else EXIT_UNCLEAN
 
 
 def _recordings(options: argparse.Namespace) -> dict[str, Recording]:
@@ -136,53 +140,63 @@ def _recordings(options: argparse.Namespace) -> dict[str, Recording]:
     return {name: recording[: options.scans] for name, recording in opened.items()}
 
 
+def _introduce(options: argparse.Namespace, recordings: dict[str, Recording], console: Console) -> None:
+    console.print(
+        f"[bold]potserver {__version__} demo[/bold]: a map server on loopback, and a robot that sends it "
+        f"{sum(map(len, recordings.values()))} scans over Zenoh.\n"
+        f"A fifth of each scan's beams is held back; at the end the maps are asked about those. Profile: {options.profile}."
+    )
+    if not options.datasets:
+        console.print(
+            "The built-in atoms were learned in made-up towns, and some on other beams of the rooms."
+        )
+    console.print(
+        "carried: kernels that the map took from transported atoms; placed: kernels added where those explain nothing;\n"
+        "W2: root of the transport cost under the entropic plan, hits plus free points (never 0, the blur counts)."
+    )
+
+
 def _run_map(endpoint: str, name: str, recording: Recording, out: Path, console: Console) -> _MapResult:
     console.print(f"[bold]{name}[/bold]: {_BUNDLED.get(name, str(recording.path))}")
-    table = Table(box=None, header_style="dim", pad_edge=False)
-    for column in ("scan", "beams", "ms", "carried", "placed", "in map"):
-        table.add_column(column, justify="right")
-    table.add_column("atom and turn of each sector (kernels, W2 in m)", overflow="fold")
-    hold_out = HoldOut()
-    receipts: list[Receipt] = []
-    held: list[LabelledPoints] = []
-    hits: list[np.ndarray[Any, np.dtype[np.float64]]] = []
-    track = []
-    planar = False
     with MapClient(endpoint, map=name, timeout_s=60.0) as client:
         client.wait_ready(60.0)
-        with console.status("") as status:
-            for number, recorded in enumerate(recording):
-                status.update(f"scan {number + 1} of {len(recording)}")
-                scan, labels = hold_out.split(recorded)
-                planar = scan.is_planar
-                receipt = client.integrate(
-                    scan.to_send, scan.T_map_sensor, robot="demo", is_return=scan.is_return
-                )
-                receipts.append(receipt)
-                held.append(labels)
-                hits.append(scan.in_map[scan.is_return])
-                track.append(scan.T_map_sensor[:3, 3])
-                m = receipt.message
-                table.add_row(
-                    str(number), str(m.n_points), f"{m.integrate_ms:.0f}", str(m.n_kernels_transported),
-                    str(m.n_kernels_added - m.n_kernels_transported), str(m.map_kernels),
-                    "  ".join(_sector(s) for s in m.sectors if s.atom_id is not None) or "none",
-                )  # fmt: skip
-        console.print(table)
-        labels = LabelledPoints.concatenate(held)
+        fed = _feed(client, recording, console)
+        heads = ("scan", "beams", "ms", "carried", "placed", "in map", _SECTORS)
+        console.print(table(heads, [_cells(n, each.receipt) for n, each in enumerate(fed)], left=(6,)))
+        labels = LabelledPoints.concatenate([each.held_out for each in fed])
         answer = client.occupancy(labels.points)
         scores = score(answer.mean, labels.occupied, answer.observed)
         queries_per_s = _query_speed(client, labels.points)
-        echoes, sensor = np.concatenate(hits), np.stack(track)
-        _draw(client, name, echoes, sensor, planar, out)
-        info = client.info()
+        _draw(client, name, [each.scan for each in fed], out)
+        n_kernels = client.info().n_kernels
     console.print(
         f"held-out beams: ACC {scores.accuracy:.3f}  AUC {scores.auc:.3f}  NLL {scores.nll:.3f}  ECE {scores.ece:.3f}"
         f"  unknown {scores.share_unknown:.1%}  of {scores.n} points; {queries_per_s:,.0f} queries/s over Zenoh\n"
     )
-    return _MapResult(
-        name, receipts, labels, answer.mean, answer.observed, scores, info.n_kernels, queries_per_s
-    )
+    receipts = [each.receipt for each in fed]
+    return _MapResult(name, receipts, labels, answer.mean, answer.observed, scores, n_kernels, queries_per_s)
+
+
+def _feed(client: MapClient, recording: Recording, console: Console) -> list[_Fed]:
+    """Send all scans without their held-out beams, each when the one before is in the map."""
+    hold_out = HoldOut()
+    fed = []
+    with console.status("") as status:
+        for number, recorded in enumerate(recording):
+            status.update(f"scan {number + 1} of {len(recording)}")
+            scan, labels = hold_out.split(recorded)
+            receipt = client.integrate(
+                scan.to_send, scan.T_map_sensor, robot="demo", is_return=scan.is_return
+            )
+            fed.append(_Fed(scan, labels, receipt))
+    return fed
+
+
+def _cells(number: int, receipt: Receipt) -> list[str]:
+    m = receipt.message
+    counts = (m.n_kernels_transported, m.n_kernels_added - m.n_kernels_transported, m.map_kernels)
+    sectors = "  ".join(map(_sector, (s for s in m.sectors if s.atom_id is not None))) or "none"
+    return [str(number), str(m.n_points), f"{m.integrate_ms:.0f}", *map(str, counts), sectors]
 
 
 def _sector(sector: SectorReport) -> str:
@@ -190,7 +204,7 @@ def _sector(sector: SectorReport) -> str:
     return f"{sector.atom_id} {math.degrees(sector.rotation_rad):+.0f}° ({sector.n_kernels}, {w2:.1f})"
 
 
-def _query_speed(client: MapClient, points: np.ndarray[Any, np.dtype[np.float64]]) -> float:
+def _query_speed(client: MapClient, points: NDArray[np.float64]) -> float:
     """Points a second near what was seen, end to end: encode, send, compute, reply, decode."""
     rng = np.random.default_rng(0)
     asked = points[rng.integers(0, len(points), _SPEED_POINTS)] + rng.normal(0.0, 0.3, (_SPEED_POINTS, 3))
@@ -199,50 +213,41 @@ def _query_speed(client: MapClient, points: np.ndarray[Any, np.dtype[np.float64]
     return _SPEED_POINTS / (time.perf_counter() - start)
 
 
-def _draw(
-    client: MapClient,
-    name: str,
-    hits: np.ndarray[Any, np.dtype[np.float64]],
-    track: np.ndarray[Any, np.dtype[np.float64]],
-    planar: bool,
-    out: Path,
-) -> None:
-    near = hits[np.abs(hits - track.mean(axis=0)).max(axis=1) <= 30.0]
+def _draw(client: MapClient, name: str, scans: list[RecordedScan], out: Path) -> None:
+    """Draw the layer of the map at the sensor's height."""
+    hits = np.concatenate([scan.in_map[scan.is_return] for scan in scans])
+    track = np.stack([scan.T_map_sensor[:3, 3] for scan in scans])
+    near = hits[np.abs(hits - track.mean(axis=0)).max(axis=1) <= _PICTURE_REACH_M]
     lower, upper = near.min(axis=0) - 1.0, near.max(axis=0) + 1.0
     cell = float((upper - lower)[:2].max()) / _PICTURE_CELLS
-    level = 0.0 if planar else float(track[:, 2].mean()) + _PICTURE_ABOVE_SENSOR_M.get(name, 0.0)
+    level = 0.0
+    if not scans[-1].is_planar:
+        level = float(track[:, 2].mean()) + _PICTURE_ABOVE_SENSOR_M.get(name, 0.0)
     lower[2], upper[2] = level - cell / 2.0, level + cell / 2.0
     grid = client.grid(lower, upper, cell)
     draw_layer(grid, out / f"{name}.png", hits=hits, path_of_sensor=track, title=name)
 
 
 def _summary(results: list[_MapResult], profile: str, elapsed_s: float) -> dict[str, Any]:
+    from potserver.numerics.threads import default_threads
+
     pooled = score(
         np.concatenate([r.mean for r in results]),
         np.concatenate([r.labels.occupied for r in results]),
         np.concatenate([r.observed for r in results]),
     )
-    times = [ms for r in results for ms in r.ms_per_scan]
+    receipts = [receipt for r in results for receipt in r.receipts]
+    speeds = [r.queries_per_s for r in results]
     return {
         "version": __version__,
         "machine": f"{platform.machine()}, {default_threads()} processors, Python {platform.python_version()}",
         "profile": profile,
-        "scans": sum(len(r.receipts) for r in results),
-        "receipts_accepted": sum(receipt.accepted for r in results for receipt in r.receipts),
-        "kernels": sum(r.kernels for r in results),
-        **_scores(pooled),
-        "ms_per_scan_median": float(np.median(times)),
-        "queries_per_s": float(np.median([r.queries_per_s for r in results])),
+        **_numbers(receipts, sum(r.kernels for r in results), pooled, float(np.median(speeds))),
         "elapsed_s": elapsed_s,
         "maps": {
             r.name: {
-                "scans": len(r.receipts),
-                "receipts_accepted": sum(receipt.accepted for receipt in r.receipts),
-                "kernels": r.kernels,
-                **_scores(r.scores),
+                **_numbers(r.receipts, r.kernels, r.scores, r.queries_per_s),
                 "ms_per_scan": r.ms_per_scan,
-                "ms_per_scan_median": float(np.median(r.ms_per_scan)),
-                "queries_per_s": r.queries_per_s,
                 "atoms": dict(
                     Counter(s.atom_id for receipt in r.receipts for s in receipt.sectors if s.atom_id)
                 ),
@@ -252,33 +257,28 @@ def _summary(results: list[_MapResult], profile: str, elapsed_s: float) -> dict[
     }
 
 
-def _scores(m: Metrics) -> dict[str, float]:
+def _numbers(receipts: list[Receipt], kernels: int, m: Metrics, queries_per_s: float) -> dict[str, Any]:
     return {
+        "scans": len(receipts),
+        "receipts_accepted": sum(receipt.accepted for receipt in receipts),
+        "kernels": kernels,
         "n_held_out": m.n, "acc": m.accuracy, "auc": m.auc, "nll": m.nll, "brier": m.brier, "ece": m.ece,
         "unknown": m.share_unknown,
+        "ms_per_scan_median": float(np.median([receipt.message.integrate_ms for receipt in receipts])),
+        "queries_per_s": queries_per_s,
     }  # fmt: skip
 
 
 def _print_totals(summary: dict[str, Any], console: Console) -> None:
-    table = Table(box=None, header_style="dim", pad_edge=False)
-    table.add_column("map")
-    for column in (
-        "scans",
-        "accepted",
-        "kernels",
-        "ms/scan",
-        "ACC",
-        "AUC",
-        "NLL",
-        "ECE",
-        "unknown",
-        "queries/s",
-    ):
-        table.add_column(column, justify="right")
-    for name, row in [*summary["maps"].items(), ("all", summary)]:
-        table.add_row(
-            name, str(row["scans"]), str(row["receipts_accepted"]), str(row["kernels"]), f"{row['ms_per_scan_median']:.0f}",
-            f"{row['acc']:.3f}", f"{row['auc']:.3f}", f"{row['nll']:.3f}", f"{row['ece']:.3f}", f"{row['unknown']:.1%}",
-            f"{row['queries_per_s']:,.0f}",
-        )  # fmt: skip
-    console.print(table)
+    heads = (
+        "map", "scans", "accepted", "kernels", "ms/scan", "ACC", "AUC", "NLL", "ECE", "unknown", "queries/s",
+    )  # fmt: skip
+    rows = [
+        (
+            name, str(row["scans"]), str(row["receipts_accepted"]), str(row["kernels"]),
+            f"{row['ms_per_scan_median']:.0f}", f"{row['acc']:.3f}", f"{row['auc']:.3f}", f"{row['nll']:.3f}",
+            f"{row['ece']:.3f}", f"{row['unknown']:.1%}", f"{row['queries_per_s']:,.0f}",
+        )
+        for name, row in [*summary["maps"].items(), ("all", summary)]
+    ]  # fmt: skip
+    console.print(table(heads, rows))

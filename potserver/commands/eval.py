@@ -1,4 +1,4 @@
-"""What `potserver eval` is told and what it shows: flags to maps, results to tables and files."""
+"""`potserver eval`: flags to maps, results to tables and files."""
 
 from __future__ import annotations
 
@@ -6,63 +6,126 @@ import argparse
 import json
 import os
 import platform
-import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-from rich.table import Table
 
+from potclient.datasets import FORMATS, FRAMES
 from potclient.errors import DatasetError, UsageError
 from potclient.holdout import HoldOut
 from potschemas import __version__
-from potserver.atoms.build.recipe import Reader, RecordingRecipe, open_recording, parse_recipe
-from potserver.config import Settings
-from potserver.domain.dictionary import AtomDictionary
+from potserver import bundled
+from potserver.commands.shared import (
+    EXIT_OK,
+    add_mapping_flags,
+    add_verb,
+    check_writable,
+    dictionary_of,
+    positive_int,
+    results_console,
+    settings_of,
+    table,
+)
 from potserver.errors import SettingsError
-from potserver.evaluation.ablations import ABLATIONS
-from potserver.evaluation.mappers import Mapper, ServiceMap
-from potserver.evaluation.peers import peer_named
-from potserver.evaluation.protocol import Evaluation, Row, evaluate
-from potserver.mapping.settings import MappingSettings
-from potserver.numerics.threads import default_threads
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from potserver.config import Settings
+    from potserver.domain.dictionary import AtomDictionary
+    from potserver.evaluation.mappers import Mapper
+    from potserver.evaluation.protocol import Evaluation, Row
+    from potserver.mapping.settings import MappingSettings
+
+_ABOUT = """\
+Measure maps on beams that they never saw: a fifth of each scan's beams is kept back, all scans go through the map scan
+by scan, and then it is asked about those beams' ends (occupied) and one point before each (free).
+
+Towns are asked about their exact truth too. Times are of maps that take turns, scan by scan, in this process.
+--peers needs `pip install 'potserver[peers]'` for OctoMap."""
+
+_EXAMPLES = """\
+examples:
+  potserver eval /data/kitti/00 --scans 20 --max-range 25
+  potserver eval /data/kitti/00 --scans 20 --max-range 25 --peers octomap:0.1,octomap:0.2,bgk:0.2,grid
+  potserver eval town:terraces:dynamic:7 --scans 25 --max-range 25 --ablations --json out/town.json
+  potserver eval town:suburb:7 --profile paper --set mapping.n_sectors=8
+  potserver eval bundled:rooms --peers grid"""
 
 _HELD_OUT = (
-    "map",
-    "kernels",
-    "bytes",
-    "ms/scan",
-    "[range]",
-    "CPU ms",
-    "ACC",
-    "AUC",
-    "NLL",
-    "Brier",
-    "ECE",
-    "unknown",
-)
+    "map", "kernels", "bytes", "ms/scan", "[range]", "CPU ms", "ACC", "AUC", "NLL", "Brier", "ECE", "unknown",
+)  # fmt: skip
 _TRUTH = {"uniform": "uniform", "near_surfaces": "near surfaces"}
+_COLUMNS = 160  # of the tables in a pipe
 
 
-def run(options: argparse.Namespace, settings: Settings) -> list[Evaluation]:
-    """Evaluate on every dataset; tables as they are known, files at the end.
+def add(commands: Any) -> None:
+    """Add the verb."""
+    parser = add_verb(
+        commands, "eval", _run, help="measure maps on held-out beams, beside other kinds of maps", description=_ABOUT,
+        epilog=_EXAMPLES,
+    )  # fmt: skip
+    parser.add_argument(
+        "datasets",
+        nargs="+",
+        metavar="DATASET",
+        help=f"recordings, as `potclient publish` takes them, or bundled:NAME ({', '.join(bundled.NAMES)})",
+    )
+    maps = parser.add_argument_group("maps")
+    add_mapping_flags(maps)
+    maps.add_argument(
+        "--ablations", action="store_true", help="rows for POT and RePOT with its priors as well"
+    )
+    maps.add_argument(
+        "--peers",
+        type=lambda text: [name for name in text.split(",") if name],
+        default=[],
+        metavar="LIST",
+        help="other maps: octomap:METRES, bgk:METRES, bgk-gap:METRES, grid; with commas",
+    )
+    _add_beam_flags(parser.add_argument_group("beams"))
+    out = parser.add_argument_group("results")
+    out.add_argument("--json", metavar="FILE", help="all numbers, with the machine and the options")
+    out.add_argument("--markdown", metavar="FILE", help="the tables, for a document")
 
-    Raises:
-        SettingsError: the flags name no map, no dataset, or no place to write to.
-        PotserverError: a map refuses a scan.
-    """
-    for name in (options.json, options.markdown):
-        if (
-            name is not None and not Path(name).absolute().parent.is_dir()
-        ):  # asked before the work, not after it
-            raise SettingsError(f"cannot write {name}: no folder {Path(name).absolute().parent}")
-    dictionary = AtomDictionary.load(settings.dictionary) if settings.dictionary else AtomDictionary.builtin()
+
+def _add_beam_flags(beams: Any) -> None:
+    beams.add_argument("--hold-out", type=float, default=0.2, metavar="SHARE", help="of the beams [0.2]")
+    beams.add_argument(
+        "--scans", default=":", metavar="N", help="the first N of each recording, or START:STOP:STEP [all]"
+    )
+    beams.add_argument(
+        "--thin", type=positive_int, default=1, metavar="N", help="every Nth beam of a scan [1]"
+    )
+    beams.add_argument(
+        "--min-range", type=float, default=0.0, metavar="M", help="nearer beams are dropped [0]"
+    )
+    beams.add_argument(
+        "--max-range", type=float, metavar="M", help="longer beams are free up to here, without an echo"
+    )
+    beams.add_argument(
+        "--no-return", type=float, metavar="M", help="of CARMEN logs: readings from here on are no echoes"
+    )
+    beams.add_argument("--format", choices=FORMATS, default="auto", help="of the recordings [auto]")
+    beams.add_argument(
+        "--frame", choices=FRAMES, default="auto", help="of PCD files: where their points are [auto]"
+    )
+
+
+def _run(options: argparse.Namespace) -> int:
+    """Evaluate on every dataset: tables as they are known, files at the end."""
+    from potserver.adapters.log import configure_logging
+    from potserver.numerics.threads import default_threads
+
+    settings = settings_of(options)
+    configure_logging("warning", "console")
+    check_writable(options.json, options.markdown)
+    dictionary = dictionary_of(settings.dictionary)
     threads = settings.threads or default_threads()
-    console = Console(highlight=False, width=None if sys.stdout.isatty() else 160)
+    console = results_console(_COLUMNS)
     console.print(_machine(threads))
     found = []
     for dataset in options.datasets:
@@ -77,47 +140,19 @@ def run(options: argparse.Namespace, settings: Settings) -> list[Evaluation]:
         Path(options.json).write_text(json.dumps(_report(found, options, threads), indent=1) + "\n")
     if options.markdown is not None:
         Path(options.markdown).write_text(to_markdown(found))
-    return found
-
-
-def our_maps(options: argparse.Namespace, settings: Settings, dictionary: AtomDictionary) -> list[Mapper]:
-    """The map that is asked for and, on request, what it is made of.
-
-    Raises:
-        SettingsError: ablations of another profile than `default`.
-    """
-    mapping, threads = settings.mapping, settings.threads or default_threads()
-    maps: list[Mapper] = [ServiceMap(mapping.profile, mapping, dictionary, threads=threads)]
-    if options.ablations:
-        if mapping.profile != "default":
-            raise SettingsError(
-                f"--ablations take parts out of profile `default`, not of `{mapping.profile}`"
-            )
-        maps += [
-            ServiceMap(name, mapping, dictionary, threads=threads, make_pipeline=make_pipeline)
-            for name, make_pipeline in ABLATIONS.items()
-        ]
-    return maps
-
-
-def to_markdown(evaluations: Sequence[Evaluation]) -> str:
-    """The tables as in a document."""
-    parts = []
-    for evaluation in evaluations:
-        parts.append(f"**{_title(evaluation)}**\n")
-        for heads, lines in _tables(evaluation):
-            rows = [heads, ["---"] * len(heads), *lines]
-            parts.append("\n".join(f"| {' | '.join(row)} |" for row in rows) + "\n")
-    return "\n".join(parts)
+    return EXIT_OK
 
 
 def _evaluate(
-    dataset: str,
-    options: argparse.Namespace,
-    settings: Settings,
-    dictionary: AtomDictionary,
-    threads: int,
+    dataset: str, options: argparse.Namespace, settings: Settings, dictionary: AtomDictionary, threads: int
 ) -> Evaluation:
+    from potserver.evaluation.ablations import ABLATIONS, label_of
+    from potserver.evaluation.mappers import ServiceMap
+    from potserver.evaluation.peers import peer_named
+    from potserver.evaluation.protocol import evaluate
+    from potserver.mapping.service import MakePipeline, MappingService, pipeline_of
+    from potserver.recordings import Reader, open_recording, scan_numbers
+
     reader = Reader(
         format=options.format,
         frame=options.frame,
@@ -126,8 +161,19 @@ def _evaluate(
         max_range_m=options.max_range,
     )
     recording = open_recording(dataset, reader)
-    numbers = asked_scans(dataset, options.scans).numbers(len(recording))
-    maps = our_maps(options, settings, dictionary)
+    numbers = scan_numbers(options.scans, len(recording))
+    mapping = settings.mapping
+    rows: dict[str, MakePipeline] = {label_of(mapping): pipeline_of}
+    if options.ablations:
+        if mapping.profile != "default":
+            raise SettingsError(
+                f"--ablations take parts out of profile `default`, not of `{mapping.profile}`"
+            )
+        rows |= ABLATIONS
+    maps: list[Mapper] = [
+        ServiceMap(name, MappingService(dictionary, mapping, threads=threads, make_pipeline=make_pipeline))
+        for name, make_pipeline in rows.items()
+    ]
     maps += [peer_named(name, threads=threads) for name in options.peers]
     with _progress(dataset, len(numbers) + len(maps)) as on_step:
         return evaluate(
@@ -141,15 +187,12 @@ def _evaluate(
         )
 
 
-def asked_scans(dataset: str, text: str | None) -> RecordingRecipe:
-    """The recording with the scans that a flag asks for, all of them by default."""
-    scans: int | str = ":" if text is None else int(text) if text.isdecimal() else text
-    return parse_recipe({"recordings": [{"dataset": dataset, "scans": scans}]}, "flags").recordings[0]
-
-
 @contextmanager
 def _progress(dataset: str, steps: int) -> Iterator[Callable[[str], None]]:
-    """A bar on stderr: a step a scan and one a map that is judged."""
+    """A bar on stderr: a step a scan, and one a map that is judged."""
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task(dataset, total=steps)
@@ -169,12 +212,7 @@ def _progress(dataset: str, steps: int) -> Iterator[Callable[[str], None]]:
 def _print(evaluation: Evaluation, console: Console, mapping: MappingSettings) -> None:
     console.print(f"\n[bold]{_title(evaluation)}[/bold]")
     for heads, lines in _tables(evaluation):
-        table = Table(box=None, pad_edge=False, header_style="dim")
-        for k, head in enumerate(heads):
-            table.add_column(head.replace("[", r"\["), justify="left" if k == 0 else "right", no_wrap=k == 0)
-        for line in lines:
-            table.add_row(*(cell.replace("[", r"\[") for cell in line))
-        console.print(table)
+        console.print(table(heads, lines))
     if evaluation.reach_m > mapping.max_range_m * 1.001:
         console.print(
             f"Our maps look {mapping.max_range_m:g} m far, the held-out beams are up to {evaluation.reach_m:.1f} m long: "
@@ -186,6 +224,17 @@ def _print(evaluation: Evaluation, console: Console, mapping: MappingSettings) -
             f"{evaluation.rows[0].name}, median ms: "
             + ", ".join(f"{stage} {ms:.0f}" for stage, ms in stages.items())
         )
+
+
+def to_markdown(evaluations: Sequence[Evaluation]) -> str:
+    """The tables as in a document."""
+    parts = []
+    for evaluation in evaluations:
+        parts.append(f"**{_title(evaluation)}**\n")
+        for heads, lines in _tables(evaluation):
+            rows = [heads, ["---"] * len(heads), *lines]
+            parts.append("\n".join(f"| {' | '.join(row)} |" for row in rows) + "\n")
+    return "\n".join(parts)
 
 
 def _title(evaluation: Evaluation) -> str:
@@ -225,14 +274,8 @@ def _held_out_cells(row: Row) -> list[str]:
     spread = "batch" if row.is_batch else f"[{min(row.scan_ms):.0f}-{max(row.scan_ms):.0f}]"
     times = [f"{np.median(row.scan_ms):.0f}", spread, f"{np.median(row.cpu_ms):.0f}"]
     scores = [f"{m.accuracy:.3f}", f"{m.auc:.4f}", f"{m.nll:.3f}", f"{m.brier:.3f}", f"{m.ece:.3f}"]
-    return [
-        row.name,
-        f"{row.size.cells:,}",
-        f"{row.size.n_bytes:,}",
-        *times,
-        *scores,
-        f"{m.share_unknown:.1%}",
-    ]
+    size = [f"{row.size.cells:,}", f"{row.size.n_bytes:,}"]
+    return [row.name, *size, *times, *scores, f"{m.share_unknown:.1%}"]
 
 
 def _number(value: float) -> str:

@@ -1,4 +1,4 @@
-"""`potserver map info | export | import | merge`: kept maps without a server."""
+"""`potserver map`: kept maps without a server: what they hold, exported, imported, merged."""
 
 from __future__ import annotations
 
@@ -8,74 +8,127 @@ import functools
 import json
 import re
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from potclient import UsageError, results
-from potclient import cli as client_cli
-from potclient.kernels import KernelSet as ClientKernels
+from potclient import cli as exporting
 from potclient.octomap import DEPTH, KEY_ORIGIN, Leaves, read_bt
-from potschemas import messages, wire
-from potserver.adapters import codec
-from potserver.asking.service import GridPlan
-from potserver.config import Settings
-from potserver.domain.dictionary import AtomDictionary
-from potserver.domain.kernel_map import KernelMap
-from potserver.domain.map_state import MapState
-from potserver.domain.types import KernelSet
+from potserver.commands.shared import EXIT_OK, add_group, add_settings_flags, add_verb, say, settings_of
 from potserver.errors import MapFileError, SettingsError
-from potserver.limits import Limits
-from potserver.mapping.imports import state_of_kernels, state_of_places
-from potserver.mapping.paper import PAPER, PotPipeline
-from potserver.mapping.service import MappingService
-from potserver.mapping.settings import MappingSettings
-from potserver.storage.journal import scans_after
-from potserver.storage.map_file import FORMAT, Origin, SavedMap, describe, read_map, write_map
-from potserver.storage.map_store import JOURNAL, SAVED, TILES
 
-Say = Callable[[str], None]
+if TYPE_CHECKING:
+    from potserver.config import Settings
+    from potserver.domain.map_state import MapState
+    from potserver.mapping.service import MakePipeline, MappingService
+    from potserver.mapping.settings import MappingSettings
+    from potserver.storage.map_file import Origin
 
-# What an OctoMap's own limits stand for: that many hits make a voxel as occupied as it can get, ln(.971 / .029) / ln(.7 / .3),
-# and that many misses as free, ln(.881 / .119) / ln(.6 / .4). A binary file says only on which side of 0.5 a voxel is.
+_INFO = """\
+What is in a saved map (*.map), in one map's folder, or in a whole store: read, checked and counted."""
+
+_EXPORT = """\
+Write a saved map as a file that other programs read, as `potclient export` does for a served one.
+
+  ply, npz   kernels
+  pgm        a picture of the plane and its YAML, for Nav2's map_server
+  bt         a binary OctoMap"""
+
+_EXPORT_EXAMPLES = """\
+examples:
+  potserver map export site.map -f ply -o kernels.ply
+  potserver map export site.map -f pgm --resolution 0.05 --band 0.1 1.5 -o map.pgm"""
+
+_IMPORT = """\
+Make a *.map file. In the folder `saved` of a server's store, `potclient map load NAME` finds it.
+
+  *.bt        a binary OctoMap: its voxels become evidence of a robot named after the file, and kernels are solved
+              on it
+  *.npz       kernels, as `potclient export npz` writes them. There is no evidence with them, so only servers of profile
+              `paper` load them; they answer by their own mapping.mean_moderation and mapping.residual_var
+  DIR, *.map  the last snapshot of a map's folder, or a saved map, written anew"""
+
+_IMPORT_EXAMPLES = """\
+examples:
+  potserver map import hall.bt -o ~/.local/state/potserver/potserver/saved/hall.map
+  potclient map load hall"""
+
+_MERGE = """\
+Write one map that knows what two saved ones know, as if one server had been fed by both. Scans that both of them hold
+would count twice. A running server takes in a saved map with `potclient map merge`."""
+
+_MERGE_EXAMPLES = """\
+examples:
+  potserver map merge south.map north.map -o campus.map
+  potserver map merge south.map north.map --pose 120 -35 0 40 -o campus.map
+                                              north's origin lies there, turned by 40 degrees"""
+
+_ONE_MAP = "a *.map file, or a map's folder in a store"
+
+# An OctoMap clamps its voxels. So many hits make one as occupied as it can get, ln(.971 / .029) / ln(.7 / .3), and so many
+# misses as free, ln(.881 / .119) / ln(.6 / .4). A binary file says only on which side of 0.5 a voxel is.
 _OCCUPIED_LOOKS = 4.1
 _FREE_LOOKS = 4.9
-# A scan spreads a beam's free evidence, one look in all, over its whole way, so a voxel of free space gets but a part of it.
-# Chosen on two OctoMaps, of rooms and of an office: 99 % of the occupied space and 96 and 89 % of the free come back as they
-# were; with 1/10 it was 100, 94 and 85 %, with all of it 97, 97 and 92 %.
+# A scan spreads a beam's free evidence, one look in all, over its whole way: a voxel of free space gets a part of it. Chosen on
+# two OctoMaps, of rooms and of an office: 99 % of the occupied space and 96 and 89 % of the free come back as they were. With
+# 1/10 it was 100, 94 and 85 %, with 1 it was 97, 97 and 92 %.
 _FREE_SHARE = 1.0 / 3.0
 _FINEST_M = 0.2
 _MAX_PLACES = 20_000_000
 
 
-def run(options: argparse.Namespace, settings: Settings, say: Say) -> int:
-    """Carry out one of the commands.
+def add(commands: Any) -> None:
+    """Add the verb."""
+    verbs = add_group(commands, "map", "see, export, import and merge kept maps")
 
-    Args:
-        options: The flags; `options.map_command` says which one.
-        settings: Of the maps that are made.
-        say: Prints a line.
-    Raises:
-        MapFileError, SettingsError, StorageError: the file, the flags, or the disk.
-    """
-    commands = {"info": _info, "export": _export, "import": _import, "merge": _merge}
-    try:
-        return commands[options.map_command](options, settings, say)
-    except UsageError as error:
-        raise SettingsError(str(error)) from error
+    info = add_verb(verbs, "info", _info, help="what saved maps or a store hold", description=_INFO)
+    info.add_argument("path", type=Path, metavar="FILE|DIR")
+    info.add_argument("--json", action="store_true", help="JSON in place of a table")
+
+    export = add_verb(
+        verbs, "export", _export, help="a saved map as a file of another program", description=_EXPORT,
+        epilog=_EXPORT_EXAMPLES,
+    )  # fmt: skip
+    export.add_argument("path", type=Path, metavar="FILE", help=_ONE_MAP)
+    export.add_argument("-f", "--format", dest="kind", choices=exporting.EXPORT_KINDS, required=True)
+    exporting.add_export_flags(export)
+
+    import_ = add_verb(
+        verbs, "import", _import, help="a saved map of what another program, or an old store, knows", description=_IMPORT,
+        epilog=_IMPORT_EXAMPLES,
+    )  # fmt: skip
+    import_.add_argument("path", type=Path, metavar="FILE|DIR")
+    import_.add_argument(
+        "--looks", type=float, default=1.0, metavar="X",
+        help="bt: how much its voxels count, in what an OctoMap can count at most [1]",
+    )  # fmt: skip
+
+    merge = add_verb(
+        verbs, "merge", _merge, help="one saved map of two", description=_MERGE, epilog=_MERGE_EXAMPLES
+    )
+    merge.add_argument("path", type=Path, metavar="FILE", help=_ONE_MAP)
+    merge.add_argument("other", type=Path, metavar="OTHER", help="the one that is taken in")
+    exporting.add_pose_flag(merge)
+
+    for writes in (import_, merge):
+        writes.add_argument(
+            "-o", "--out", type=Path, required=True, metavar="FILE", help="the *.map file to write"
+        )
+        add_settings_flags(writes)
 
 
 # --- info -------------------------------------------------------------------------------------------------------------
 
 
-def _info(options: argparse.Namespace, _settings: Settings, say: Say) -> int:
+def _info(options: argparse.Namespace) -> int:
     found = [_described(path) for path in _map_files(options.path)]
     if options.json:
         say(json.dumps(found, indent=2))
-        return 0
+        return EXIT_OK
     for number, each in enumerate(found):
         if number:
             say("")
@@ -83,7 +136,7 @@ def _info(options: argparse.Namespace, _settings: Settings, say: Say) -> int:
         for key, value in each.items():
             text = ", ".join(map(str, value)) if isinstance(value, list) else str(value)
             say(f"{key.ljust(width)}  {text}")
-    return 0
+    return EXIT_OK
 
 
 def _map_files(path: Path) -> list[Path]:
@@ -92,6 +145,8 @@ def _map_files(path: Path) -> list[Path]:
     Raises:
         MapFileError: there are none.
     """
+    from potserver.storage.map_store import SAVED, TILES
+
     if not path.is_dir():
         return [path]
     found = [path / TILES] if (path / TILES).exists() else sorted(path.glob(f"*/{TILES}"))
@@ -101,10 +156,20 @@ def _map_files(path: Path) -> list[Path]:
     return found
 
 
+def _one_file(path: Path) -> Path:
+    (file, *others) = _map_files(path)
+    if others:
+        raise SettingsError(f"{path} holds several maps; name one: {', '.join(map(str, [file, *others]))}")
+    return file
+
+
 def _described(path: Path) -> dict[str, Any]:
+    from potserver.storage.journal import scans_after
+    from potserver.storage.map_file import FORMAT, describe, read_map
+    from potserver.storage.map_store import JOURNAL, TILES
+
     saved = read_map(path)
     r, table = saved.record, describe(saved, path)
-    n_tiles = 0 if saved.tiled is None else len(saved.tiled.tiles)
     lines: dict[str, Any] = {
         "file": str(path),
         "map": r.map_id,
@@ -114,7 +179,7 @@ def _described(path: Path) -> dict[str, Any]:
         "scans": r.n_scans,
         "revision": r.revision,
         "robots": r.robots,
-        "tiles": n_tiles,
+        "tiles": r.n_tiles,
         "kernels": table.n_kernels,
         "rows": table.n_rows,
         "bytes": _bytes_on_disk(path),
@@ -130,7 +195,7 @@ def _described(path: Path) -> dict[str, Any]:
 
 
 def _bytes_on_disk(path: Path) -> int:
-    """Of a file and of what SQLite keeps beside it until it is copied in: a store's newest tiles may be there alone."""
+    """Of a file, and of the log that SQLite keeps beside it until it is copied in: the newest tiles may be there alone."""
     log = path.with_name(f"{path.name}-wal")
     return path.stat().st_size + (log.stat().st_size if log.exists() else 0)
 
@@ -138,76 +203,12 @@ def _bytes_on_disk(path: Path) -> int:
 # --- export -----------------------------------------------------------------------------------------------------------
 
 
-class UnservedMap:
-    """A saved map that answers like a `MapClient`, as far as exports ask."""
+def _export(options: argparse.Namespace) -> int:
+    from potserver.commands.unserved import UnservedMap
+    from potserver.storage.map_file import read_map
 
-    def __init__(self, saved: SavedMap) -> None:
-        self._record = saved.record
-        self._parts = [] if saved.tiled is None else [part.kernels for part in saved.tiled.parts.values()]
-        indexed = [] if saved.tiled is None else list(saved.tiled.parts.values())
-        self._map = KernelMap(indexed, rule=saved.record.answer_rule, map_revision=saved.record.revision)
-
-    def info(self) -> messages.Info:
-        """What the map is."""
-        r = self._record
-        encoded = codec.encode_info(
-            server_id="unserved",
-            version=r.written_by,
-            map_id=r.map_id,
-            maps=[r.map_id],
-            profile="default" if r.keeps_evidence else "paper",
-            snapshot=self._map,
-            n_atoms=0,
-            n_scans=r.n_scans,
-            tile_size_m=r.grid[0] if r.grid else MappingSettings().tile_size_m,
-            max_range_m=0.0,
-            limits=Limits(),
-            started_ns=r.written_ns,
-            durable=True,
-        )
-        return wire.decode(encoded.payload, messages.Info)
-
-    def params_parts(
-        self, lower: ArrayLike | None = None, upper: ArrayLike | None = None
-    ) -> Iterator[tuple[int, int, ClientKernels]]:
-        """Kernels, part by part; those in a box (m, map frame) if there is one."""
-        low = np.full(3, -np.inf) if lower is None else np.asarray(lower, np.float64)
-        high = np.full(3, np.inf) if upper is None else np.asarray(upper, np.float64)
-        for number, kernels in enumerate(self._parts):
-            hinge = kernels.hinge_mean
-            inside = np.flatnonzero(((hinge >= low) & (hinge <= high)).all(axis=1))
-            message = codec.encode_kernels(kernels.take(inside), self._map.rule)
-            yield (
-                number,
-                len(self._parts),
-                ClientKernels.from_message(message, map_revision=self._map.map_revision),
-            )
-
-    def grid(self, lower: ArrayLike, upper: ArrayLike, resolution: float) -> results.Grid:
-        """Occupancy at the cell centres of a box, m, map frame."""
-        low, high = np.asarray(lower, np.float64), np.asarray(upper, np.float64)
-        nx, ny, nz = (int(n) for n in np.ceil((high - low) / resolution - 1e-6))
-        plan = GridPlan(self._map, low, resolution, (nx, ny, nz), part_cells=nx * ny * nz)
-        _, o = plan.part(0)
-
-        def cells(array: NDArray[Any]) -> NDArray[np.float32]:
-            return array.astype(np.float32).reshape(nx, ny, nz)
-
-        return results.Grid(
-            lower=low,
-            resolution=resolution,
-            mean=cells(o.mean),
-            var=cells(o.var),
-            latent_mean=cells(o.latent_mean),
-            latent_var=cells(o.latent_var),
-            observed=o.observed.reshape(nx, ny, nz),
-            revision=self._map.map_revision,
-        )
-
-
-def _export(options: argparse.Namespace, _settings: Settings, _say: Say) -> int:
-    client_cli.check_export_flags(options)
-    return client_cli.export_map(UnservedMap(read_map(_one_file(options.path))), options)
+    exporting.check_export_flags(options)
+    return exporting.export_map(UnservedMap(read_map(_one_file(options.path))), options)
 
 
 # --- import -----------------------------------------------------------------------------------------------------------
@@ -221,54 +222,58 @@ class Places(NamedTuple):
     weight: NDArray[np.float32]  # (N,) looks
 
 
-def _import(options: argparse.Namespace, settings: Settings, say: Say) -> int:
-    path: Path = options.path
+def _import(options: argparse.Namespace) -> int:
+    from potserver.storage.map_file import Origin, write_map
+
+    settings, path = settings_of(options), options.path
+    origin = Origin(settings.maps[0], True, {})
     if path.suffix == ".bt":
-        state, keeps_evidence = _from_octomap(path, options.looks, settings, say), True
-        stamps: dict[str, int] = {}
-        map_id = settings.maps[0]
+        state = _from_octomap(path, options.looks, settings)
     elif path.suffix == ".npz":
-        state, keeps_evidence = _from_kernels(path, settings), False
-        stamps, map_id = {}, settings.maps[0]
+        state, origin = _from_kernels(path, settings), origin._replace(keeps_evidence=False)
     else:
-        file = _one_file(path)
-        saved = read_map(file)
-        state, keeps_evidence = _with_rule(saved), saved.record.keeps_evidence
-        stamps, map_id = saved.record.stamps, saved.record.map_id
-        left = scans_after(file.with_name(JOURNAL), saved.record.number) if file.name == TILES else 0
-        if left:
-            say(f"{left} scans of the journal are not in it: only a server integrates them")
-    n_bytes = write_map(options.out, state, Origin(map_id, keeps_evidence, stamps))
+        state, origin = _from_saved(_one_file(path))
+    n_bytes = write_map(options.out, state, origin)
     say(f"wrote {options.out}: {len(state.snapshot)} kernels, {n_bytes} bytes")
-    return 0
+    return EXIT_OK
 
 
-def _with_rule(saved: SavedMap) -> MapState:
-    """The state whose snapshot answers as the saved one did."""
-    parts = [] if saved.tiled is None else list(saved.tiled.parts.values())
-    state = saved.state()
-    snapshot = KernelMap(parts, rule=saved.record.answer_rule, map_revision=saved.record.revision)
-    return dataclasses.replace(state, snapshot=snapshot)
+def _from_saved(file: Path) -> tuple[MapState, Origin]:
+    """The state in a map file, whose snapshot answers as the saved one did, and its `Origin`."""
+    from potserver.storage.journal import scans_after
+    from potserver.storage.map_file import Origin, read_map
+    from potserver.storage.map_store import JOURNAL, TILES
+
+    saved = read_map(file)
+    r = saved.record
+    left = scans_after(file.with_name(JOURNAL), r.number) if file.name == TILES else 0
+    if left:
+        say(f"{left} scans of the journal are not in it: only a server integrates them")
+    state = dataclasses.replace(saved.state(), snapshot=saved.kernel_map())
+    return state, Origin(r.map_id, r.keeps_evidence, r.stamps)
 
 
-def _from_octomap(path: Path, looks: float, settings: Settings, say: Say) -> MapState:
-    leaves, resolution = _read(lambda: read_bt(path), path)
+def _from_octomap(path: Path, looks: float, settings: Settings) -> MapState:
+    from potserver.mapping.imports import state_of_places
+
+    with _read_errors(path):
+        leaves, resolution = read_bt(path)
     fine_m = settings.mapping.resolution_m or max(resolution, _FINEST_M)
     places = places_of(leaves, resolution, fine_m, looks)
     say(
         f"{len(leaves.depth)} voxels of {resolution:g} m, {int(leaves.occupied.sum())} occupied:"
         f" {len(places.points)} samples at a resolution of {fine_m:g} m"
     )
-    service = MappingService(AtomDictionary(()), settings.mapping, threads=settings.threads)
     robot = re.sub(r"[^a-z0-9_.-]", "-", path.stem.lower()).lstrip("_.-")[:63] or "octomap"
+    service = _service(settings.mapping, settings)
     return state_of_places(service, *places, source=robot, fine_m=fine_m)
 
 
 def places_of(leaves: Leaves, resolution: float, fine_m: float, looks: float = 1.0) -> Places:
     """Samples that say what voxels say.
 
-    A voxel larger than the resolution wanted gives one sample for each of its parts of that size; the samples of those that are
-    smaller meet in the map's own voxels, where they share what one of them would weigh.
+    A voxel larger than the resolution wanted gives one sample for each of its parts of that size. Samples of smaller voxels
+    meet in a voxel of the map, where they share what one sample of its size would weigh.
 
     Args:
         leaves: Of an OctoMap.
@@ -288,7 +293,7 @@ def places_of(leaves: Leaves, resolution: float, fine_m: float, looks: float = 1
             f"its voxels make {total} samples, the limit is {_MAX_PLACES}: take a coarser map,"
             " --set mapping.resolution_m=METRES"
         )
-    points, occupied, weight = [], [], []
+    points, occupied, weight = [np.zeros((0, 3))], [np.zeros(0, bool)], [np.zeros(0)]
     for n in np.unique(per_edge):
         members = np.flatnonzero(per_edge == n)
         steps = (np.stack(np.meshgrid(*[np.arange(n)] * 3, indexing="ij"), axis=-1).reshape(-1, 3) + 0.5) / n
@@ -302,26 +307,40 @@ def places_of(leaves: Leaves, resolution: float, fine_m: float, looks: float = 1
         hits = _OCCUPIED_LOOKS * np.minimum(1.0, (edge / (0.5 * fine_m)) ** 2)
         free = _FREE_LOOKS * _FREE_SHARE * np.minimum(1.0, (edge / fine_m) ** 3)
         weight.append(looks * np.where(state, hits, free))
-    return Places(
-        np.concatenate([np.zeros((0, 3)), *points]),
-        np.concatenate([np.zeros(0, bool), *occupied]),
-        np.concatenate([np.zeros(0), *weight]).astype(np.float32),
-    )
+    return Places(np.concatenate(points), np.concatenate(occupied), np.concatenate(weight).astype(np.float32))
 
 
 def _from_kernels(path: Path, settings: Settings) -> MapState:
-    kernels = _read(lambda: ClientKernels.load(path), path)
-    make_pipeline = functools.partial(PotPipeline, method=PAPER._replace(rule=kernels.rule))
-    service = MappingService(
-        AtomDictionary(()), settings.mapping, threads=settings.threads, make_pipeline=make_pipeline
+    from potclient.kernels import KernelSet as ClientKernels
+    from potserver.domain.types import KernelSet
+    from potserver.mapping.imports import state_of_kernels
+    from potserver.mapping.paper import PAPER, PotPipeline
+
+    with _read_errors(path):
+        kernels = ClientKernels.load(path)
+    service = _service(
+        settings.mapping, settings, functools.partial(PotPipeline, method=PAPER._replace(rule=kernels.rule))
     )
     arrays = {f.name: getattr(kernels, f.name) for f in dataclasses.fields(KernelSet)}
     return state_of_kernels(service, KernelSet(**arrays))
 
 
-def _read(read: Callable[[], Any], path: Path) -> Any:
+def _service(
+    mapping: MappingSettings, settings: Settings, make_pipeline: MakePipeline | None = None
+) -> MappingService:
+    """An empty map without atoms."""
+    from potserver.domain.dictionary import AtomDictionary
+    from potserver.mapping.service import MappingService, pipeline_of
+
+    return MappingService(
+        AtomDictionary(()), mapping, threads=settings.threads, make_pipeline=make_pipeline or pipeline_of
+    )
+
+
+@contextmanager
+def _read_errors(path: Path) -> Iterator[None]:
     try:
-        return read()
+        yield
     except OSError as error:
         raise MapFileError(f"cannot read {path}: {error.strerror or error}", reason="missing") from error
 
@@ -329,32 +348,27 @@ def _read(read: Callable[[], Any], path: Path) -> Any:
 # --- merge ------------------------------------------------------------------------------------------------------------
 
 
-def _merge(options: argparse.Namespace, settings: Settings, say: Say) -> int:
+def _merge(options: argparse.Namespace) -> int:
+    from potserver.storage.map_file import Origin, read_map, write_map
+
+    settings = settings_of(options)
     ours, theirs = (read_map(_one_file(path)) for path in (options.path, options.other))
     if ours.record.keeps_evidence != theirs.record.keeps_evidence:
         raise MapFileError(
             "one map keeps evidence and the other kernels alone: they cannot be merged", reason="settings"
         )
     size_m = ours.record.grid[0] if ours.record.grid else settings.mapping.tile_size_m
-    mapping = dataclasses.replace(settings.mapping, tile_size_m=size_m)
-    service = MappingService(AtomDictionary(()), mapping, threads=settings.threads)
+    service = _service(dataclasses.replace(settings.mapping, tile_size_m=size_m), settings)
     service.restore(ours.state())
     say(f"merging {theirs.record.n_scans} scans into {ours.record.n_scans}: some seconds for a street")
-    change = service.merge(theirs.state(), client_cli.pose_of(*options.pose) if options.pose else np.eye(4))
+    pose = exporting.pose_of(*options.pose) if options.pose else np.eye(4)
+    change = service.merge(theirs.state(), pose)
     stamps = dict(ours.record.stamps)
     for robot_id, stamp_ns in theirs.record.stamps.items():
         stamps[robot_id] = max(stamp_ns, stamps.get(robot_id, 0))
-    n_bytes = write_map(
-        options.out, service.state, Origin(ours.record.map_id, ours.record.keeps_evidence, stamps)
-    )
+    origin = Origin(ours.record.map_id, ours.record.keeps_evidence, stamps)
+    n_bytes = write_map(options.out, service.state, origin)
     say(
         f"wrote {options.out}: {len(service.snapshot)} kernels, {len(change.tiles)} tiles changed, {n_bytes} bytes"
     )
-    return 0
-
-
-def _one_file(path: Path) -> Path:
-    (file, *others) = _map_files(path)
-    if others:
-        raise SettingsError(f"{path} holds several maps; name one: {', '.join(map(str, [file, *others]))}")
-    return file
+    return EXIT_OK

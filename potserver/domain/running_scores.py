@@ -9,13 +9,12 @@ import numpy as np
 
 from potschemas.answers import occupancy_mean
 from potserver.domain.types import Bool, Float32, Float64
+from potserver.numerics import scores
 
 # Shares of the latent variance that may pull means towards 0.5; the best of them on the checked beams is used.
 MODERATIONS = (0.0, 0.0125, 0.025, 0.05, 0.1, 0.2, 0.4, 1.0)
 _MEMORY = 20_000.0  # points after which older ones count a third
 _ENOUGH = 500.0  # points before the choice is left to them
-_N_BINS = 15
-_CLIP = 1e-6
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
@@ -25,7 +24,9 @@ class RunningScores:
     n_points: float = 0.0
     nll: Float64 = dataclasses.field(default_factory=lambda: np.zeros(len(MODERATIONS)))  # (M,) nats, sum
     brier: float = 0.0  # sum
-    bins: Float64 = dataclasses.field(default_factory=lambda: np.zeros((_N_BINS, 3)))  # n, sum of p, sum of y
+    bins: Float64 = dataclasses.field(
+        default_factory=lambda: np.zeros((scores.N_BINS, 3))
+    )  # n, sum of p, sum of y
 
     def with_points(
         self, latent_mean: Float32, latent_var: Float32, occupied: Bool, moderation: float
@@ -40,20 +41,15 @@ class RunningScores:
         if len(occupied) == 0:
             return self
         keep = math.exp(-len(occupied) / _MEMORY)
-        truth = occupied.astype(np.float64)
-
-        def nll(share: float) -> float:
-            p = np.clip(occupancy_mean(latent_mean, latent_var, share), _CLIP, 1.0 - _CLIP)
-            return float(-np.log(np.where(occupied, p, 1.0 - p)).sum())
-
         p = occupancy_mean(latent_mean, latent_var, moderation)
-        member = np.minimum((p * _N_BINS).astype(np.int64), _N_BINS - 1)
-        new = np.stack([np.bincount(member, w, _N_BINS) for w in (np.ones(len(p)), p, truth)], axis=1)
+        nll = [
+            scores.nll_sum(occupancy_mean(latent_mean, latent_var, share), occupied) for share in MODERATIONS
+        ]
         return RunningScores(
             n_points=keep * self.n_points + len(occupied),
-            nll=keep * self.nll + np.array([nll(share) for share in MODERATIONS]),
-            brier=keep * self.brier + float(np.square(p - truth).sum()),
-            bins=keep * self.bins + new,
+            nll=keep * self.nll + np.array(nll),
+            brier=keep * self.brier + scores.brier_sum(p, occupied),
+            bins=keep * self.bins + scores.calibration_bins(p, occupied),
         )
 
     def moderation(self, default: float) -> float:
@@ -73,8 +69,4 @@ class RunningScores:
     @property
     def ece(self) -> float:
         """Expected calibration error over 15 bins of equal width; NaN before the first point."""
-        return (
-            float(np.abs(self.bins[:, 1] - self.bins[:, 2]).sum()) / self.n_points
-            if self.n_points
-            else math.nan
-        )
+        return scores.calibration_error(self.bins, self.n_points) if self.n_points else math.nan

@@ -1,9 +1,11 @@
-"""Our map with parts of it taken out: rows of `potserver eval --ablations`, no part of the product.
+"""Our map with parts of the method taken out: rows of `potserver eval --ablations`, no part of the product.
 
-A row's name says what ran. All of them share the settings, labels, sectors and atoms of `default`.
+A row's name says what ran. All of them share the settings, labels, sectors and atoms of profile `default`.
 """
 
 from __future__ import annotations
+
+import dataclasses
 
 from potserver.domain.tiles import TiledMap
 from potserver.domain.types import KernelSet
@@ -11,9 +13,9 @@ from potserver.mapping.carrying import Carrier
 from potserver.mapping.default import DefaultPipeline
 from potserver.mapping.fusion import Fused, Look, Moment
 from potserver.mapping.paper import PotPipeline
-from potserver.mapping.pipeline import LabelledScan, ScanMap
+from potserver.mapping.pipeline import LabelledScan, Pipeline, ScanMap
 from potserver.mapping.refinement import flat_prior
-from potserver.mapping.service import MakePipeline
+from potserver.mapping.settings import MappingSettings
 from potserver.mapping.stopwatch import Stopwatch
 
 
@@ -44,8 +46,19 @@ class FlatRePotPipeline(RePotPipeline):
         return flat_prior(carried, self.method.rule.prior_var)
 
 
-ABLATIONS: dict[str, MakePipeline] = {
+ABLATIONS: dict[str, type[Pipeline]] = {
     "POT, not refined": PotPipeline,
     "RePOT, transported prior": RePotPipeline,
     "RePOT, flat prior": FlatRePotPipeline,
 }
+
+
+def label_of(settings: MappingSettings) -> str:
+    """The profile, and the settings that differ from it."""
+    profile = MappingSettings.of_profile(settings.profile)
+    changed = [
+        f"{field.name}={value}"
+        for field in dataclasses.fields(settings)
+        if (value := getattr(settings, field.name)) != getattr(profile, field.name)
+    ]
+    return ", ".join([settings.profile, *changed])

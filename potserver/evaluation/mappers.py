@@ -9,12 +9,10 @@ import numpy as np
 
 from potclient.datasets import RecordedScan
 from potclient.results import Bool, Float64
-from potserver.atoms.build.scan_task import to_scan
-from potserver.domain.dictionary import AtomDictionary
 from potserver.domain.kernel_map import KernelMap
 from potserver.domain.types import KernelSet
-from potserver.mapping.service import MakePipeline, MappingService, pipeline_of
-from potserver.mapping.settings import MappingSettings
+from potserver.mapping.service import MappingService
+from potserver.recordings import to_scan
 
 _NUMBERS_A_KERNEL = 10  # position, its variances, gamma's shape and rate, the weight and its variance
 
@@ -66,23 +64,11 @@ class ServiceMap(Mapper):
 
     Args:
         name: Of the row.
-        settings: Of the map.
-        dictionary: The atoms.
-        threads: Threads that integrating one scan may use.
-        make_pipeline: The profile's by default.
+        service: An empty one.
     """
 
-    def __init__(
-        self,
-        name: str,
-        settings: MappingSettings,
-        dictionary: AtomDictionary,
-        *,
-        threads: int,
-        make_pipeline: MakePipeline = pipeline_of,
-    ) -> None:
-        self.name = name
-        self._service = MappingService(dictionary, settings, threads=threads, make_pipeline=make_pipeline)
+    def __init__(self, name: str, service: MappingService) -> None:
+        self.name, self._service = name, service
         self._n_scans = 0
 
     def warm_up(self, *, planar: bool) -> None:

@@ -1,7 +1,7 @@
 """The journal of a map: every accepted scan, from before it is in the map until a snapshot has it.
 
-scans    a row a scan: its number, and the bytes of `pot.cloud.v1` with pose and robot, and their digest
-head     one row: which scans there must be (`_Head`), and its digest
+scans    a row a scan: its number, and the bytes of `pot.cloud.v1` with pose and robot, sealed
+head     one row: which scans there must be (`_Head`), sealed
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from pathlib import Path
 import msgspec
 
 from potserver.errors import MapFileError
+from potserver.storage.seal import sealed, unsealed
 from potserver.storage.sqlite import Kind, connect, connect_read_only, reading, transaction
-from potserver.storage.tile_codec import DIGEST_BYTES, digest_of
 
 FORMAT = 1
 _KIND = Kind(
@@ -66,7 +66,7 @@ class Journal:
 
     @property
     def store_id(self) -> str:
-        """Drawn when the journal was made; the tiles bear it too."""
+        """Drawn when the journal was made; the map file of the same store holds it too."""
         return self._head.store_id
 
     @property
@@ -91,7 +91,7 @@ class Journal:
         number = self._head.last + 1
         with transaction(self._connection, self._path):
             self._connection.execute(
-                "INSERT INTO scans VALUES (?, ?)", (number, cloud + _digest(number, cloud))
+                "INSERT INTO scans VALUES (?, ?)", (number, sealed(cloud, place=_place(number)))
             )
             self._prune(prune_to)
             head = self._put_head(last=number, pruned=max(prune_to, self.pruned))
@@ -108,12 +108,12 @@ class Journal:
                 row = self._connection.execute(
                     "SELECT data FROM scans WHERE number = ?", (number,)
                 ).fetchone()
-            data = row[0] if row is not None else b""
-            if not isinstance(data, bytes) or data[-DIGEST_BYTES:] != _digest(number, data[:-DIGEST_BYTES]):
+            cloud = None if row is None else unsealed(row[0], place=_place(number))
+            if cloud is None:
                 raise self._damaged(
                     f"scan {number} of {self.last}", "is missing or does not fit its checksum"
                 )
-            yield number, data[:-DIGEST_BYTES]
+            yield number, cloud
 
     def close(self, *, complete_to: int | None = None) -> None:
         """Close; a second time does nothing.
@@ -141,15 +141,16 @@ class Journal:
 
     def _put_head(self, **changes: int | bool) -> _Head:
         head = msgspec.structs.replace(self._head, **changes)
-        content = msgspec.json.encode(head)
-        self._connection.execute("INSERT OR REPLACE INTO head VALUES (0, ?)", (content + digest_of(content),))
+        content = sealed(msgspec.json.encode(head))
+        self._connection.execute("INSERT OR REPLACE INTO head VALUES (0, ?)", (content,))
         return head
 
-    def _parse(self, content: object) -> _Head:
-        if not isinstance(content, bytes) or digest_of(content[:-DIGEST_BYTES]) != content[-DIGEST_BYTES:]:
+    def _parse(self, data: object) -> _Head:
+        content = unsealed(data)
+        if content is None:
             raise self._damaged("its head", "does not fit its checksum")
         try:
-            return msgspec.json.decode(content[:-DIGEST_BYTES], type=_Head)
+            return msgspec.json.decode(content, type=_Head)
         except msgspec.DecodeError as error:
             raise self._damaged("its head", str(error)) from error
 
@@ -172,5 +173,6 @@ def scans_after(path: Path, number: int) -> int:
     return int(row[0])
 
 
-def _digest(number: int, cloud: bytes) -> bytes:
-    return digest_of(number.to_bytes(8, "little"), cloud)
+def _place(number: int) -> bytes:
+    """A scan's number is part of its seal: a scan that stands at another number is damaged."""
+    return number.to_bytes(8, "little")

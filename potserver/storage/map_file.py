@@ -1,8 +1,8 @@
 """Maps as files: `tiles.sqlite` of a store, which is kept up to date, and `*.map`, which is written once. One format.
 
 tiles    a row a tile: its index, and `tile_codec`'s bytes
-map      one row: everything else (`MapRecord`) as JSON, and its digest; it counts the tiles and sums their digests, so that a
-         file that lost one is recognised
+map      one row: everything else (`MapRecord`) as JSON, sealed. It counts the tiles and sums their digests: a file that lost
+         a tile is recognised
 """
 
 from __future__ import annotations
@@ -28,8 +28,9 @@ from potserver.domain.running_scores import RunningScores
 from potserver.domain.tiles import Tile, TiledMap, TileGrid, TileIndex
 from potserver.domain.types import KernelSet
 from potserver.errors import MapFileError, StorageError
+from potserver.storage.seal import SEAL_BYTES, seal_number, sealed, unsealed
 from potserver.storage.sqlite import Kind, after_damage, connect, connect_read_only, reading, transaction
-from potserver.storage.tile_codec import DIGEST_BYTES, decode_tile, digest_of, encode_tile
+from potserver.storage.tile_codec import decode_tile, encode_tile
 
 FORMAT = 1
 _KIND = Kind(
@@ -40,7 +41,7 @@ _KIND = Kind(
         "CREATE TABLE map (id INTEGER PRIMARY KEY CHECK (id = 0), record BLOB NOT NULL)",
     ),
 )
-_SUM_LIMIT = 1 << 8 * DIGEST_BYTES
+_SUM_LIMIT = 1 << 8 * SEAL_BYTES
 
 
 class MapRecord(msgspec.Struct, frozen=True, kw_only=True):
@@ -82,6 +83,11 @@ class SavedMap(NamedTuple):
     record: MapRecord
     tiled: TiledMap | None
 
+    def kernel_map(self) -> KernelMap:
+        """The map that answers as the saved one did."""
+        parts = [] if self.tiled is None else list(self.tiled.parts.values())
+        return KernelMap(parts, rule=self.record.answer_rule, map_revision=self.record.revision)
+
     def state(self, *, epoch: int | None = None, revision: int | None = None) -> MapState:
         """What `MappingService.restore` takes; it puts together the kernels that queries are answered from.
 
@@ -106,7 +112,7 @@ class SavedMap(NamedTuple):
 
 
 class Origin(NamedTuple):
-    """Of what a file is a copy."""
+    """Which map a file holds, and where in a store's journal it stands."""
 
     map_id: str
     keeps_evidence: bool
@@ -166,12 +172,10 @@ class MapFile:
                     "INSERT INTO tiles VALUES (?, ?, ?, ?) ON CONFLICT (x, y, z) DO UPDATE SET data = excluded.data",
                     (*index, data),
                 )
-                known[index] = (tile.revision, _digest_number(data))
+                known[index] = (tile.revision, seal_number(data))
                 n_bytes += len(data)
-            record = msgspec.json.encode(_record_of(state, origin, known))
-            self._connection.execute(
-                "INSERT OR REPLACE INTO map VALUES (0, ?)", (record + digest_of(record),)
-            )
+            record = sealed(msgspec.json.encode(_record_of(state, origin, known)))
+            self._connection.execute("INSERT OR REPLACE INTO map VALUES (0, ?)", (record,))
         self._written, self._epoch = known, state.epoch
         return n_bytes
 
@@ -229,20 +233,20 @@ def read_map(path: Path) -> SavedMap:
     return saved
 
 
-class TileTable(NamedTuple):
-    """Sizes of a file's content."""
+class Contents(NamedTuple):
+    """How much a file holds."""
 
     n_rows: int
     n_kernels: int
     n_bytes: int  # of the tiles as they are kept
 
 
-def describe(saved: SavedMap, path: Path) -> TileTable:
+def describe(saved: SavedMap, path: Path) -> Contents:
     """Count what a map file holds."""
     tiles = [] if saved.tiled is None else list(saved.tiled.tiles.values())
     with contextlib.closing(connect_read_only(path, _KIND)) as connection, reading(path):
         n_bytes = int(connection.execute("SELECT COALESCE(SUM(LENGTH(data)), 0) FROM tiles").fetchone()[0])
-    return TileTable(
+    return Contents(
         n_rows=sum(len(tile.rows.occupied) for tile in tiles),
         n_kernels=sum(len(tile.kernels) for tile in tiles),
         n_bytes=n_bytes,
@@ -302,7 +306,7 @@ def _read(
             if list(index) != named:
                 raise _damaged(path, f"tile {index} stands at {tuple(named)}")
             tiles[index] = tile
-            written[index] = (tile.revision, _digest_number(data))
+            written[index] = (tile.revision, seal_number(data))
     if len(tiles) != record.n_tiles or f"{_sum(d for _, d in written.values()):x}" != record.tiles_digest:
         raise _damaged(path, f"it has {len(tiles)} tiles, and not the {record.n_tiles} that were written")
     if grid is None:
@@ -311,11 +315,12 @@ def _read(
     return SavedMap(record, tiled)
 
 
-def _parse(path: Path, content: object) -> MapRecord:
-    if not isinstance(content, bytes) or digest_of(content[:-DIGEST_BYTES]) != content[-DIGEST_BYTES:]:
+def _parse(path: Path, data: object) -> MapRecord:
+    content = unsealed(data)
+    if content is None:
         raise _damaged(path, "the checksum of its record does not fit")
     try:
-        record = msgspec.json.decode(content[:-DIGEST_BYTES], type=MapRecord)
+        record = msgspec.json.decode(content, type=MapRecord)
     except msgspec.DecodeError as error:
         raise _damaged(path, f"its record: {error}") from error
     empty = RunningScores()
@@ -330,10 +335,6 @@ def _parse(path: Path, content: object) -> MapRecord:
 
 def _damaged(path: Path, what: str) -> MapFileError:
     return MapFileError(f"{path} is damaged: {what}{after_damage(path)}", reason="damaged")
-
-
-def _digest_number(data: bytes) -> int:
-    return int.from_bytes(data[-DIGEST_BYTES:], "little")
 
 
 def _sum(numbers: Iterable[int]) -> int:

@@ -1,9 +1,9 @@
 """Where a map survives: a journal of accepted scans, and snapshots of the tiles that they made.
 
-A scan is in the journal, on the disk, before it is in the map, and so before anybody is told that it is. Snapshots are
-written beside the writer, from states that never change; what a snapshot has, the journal forgets with its next scan. At the
-start the last snapshot is read and the journal after it is integrated again. Two files, so that a long snapshot never holds up
-a scan; each knows what the other must have, so that one that is lost or old is noticed.
+A scan is in the journal, on the disk, before it is in the map and before anybody is told so. A thread of its own writes
+snapshots, from states that never change. What a snapshot has, the journal forgets with its next scan. At the start the last
+snapshot is read, and the journal's scans after it are integrated again. There are two files so that a long snapshot never holds
+up a scan. Each knows what the other must have: a file that is lost or old is noticed.
 """
 
 from __future__ import annotations
@@ -17,7 +17,6 @@ from typing import NamedTuple
 
 from potserver.adapters import codec
 from potserver.adapters.log import get_logger
-from potserver.adapters.ports import Mapper
 from potserver.adapters.threads import spawn
 from potserver.domain.map_state import MapState
 from potserver.domain.types import Scan
@@ -30,12 +29,15 @@ from potserver.errors import (
     UnsupportedError,
 )
 from potserver.health import Health
+from potserver.mapping.service import MappingService
 from potserver.storage.journal import Journal
 from potserver.storage.map_file import MapFile, Origin, SavedMap, read_map, write_map
 
 log = get_logger("potserver.store")
 
 JOURNAL, TILES, SAVED = "journal.sqlite", "tiles.sqlite", "saved"
+SNAPSHOT_SCANS = 50  # a restart integrates at most so many again: seconds
+SNAPSHOT_BYTES = 64 * 2**20  # large scans make a snapshot due earlier
 _REPORT_S = 2.0  # between two lines of progress
 _IN_MEMORY = "this server keeps its maps in memory only: start it with --store DIR, or without --in-memory"
 
@@ -69,8 +71,8 @@ class MapStore:
         keeps_evidence: bool,
         health: Health,
         fsync: bool = True,
-        snapshot_scans: int = 50,
-        snapshot_bytes: int = 64 * 2**20,
+        snapshot_scans: int = SNAPSHOT_SCANS,
+        snapshot_bytes: int = SNAPSHOT_BYTES,
         max_saved: int = 100,
     ) -> None:
         """Open the folder `<folder>/<map_id>`, or make it.
@@ -80,9 +82,9 @@ class MapStore:
             map_id: Of this one.
             keeps_evidence: Whether the map keeps rows, and not only kernels: a map of the other kind is refused.
             health: Gets counts and times.
-            fsync: Wait for the disk with each scan; without, a crash of the machine, though not of the process, may take
-                the last ones.
-            snapshot_scans, snapshot_bytes: Of the journal, after which a snapshot is written.
+            fsync: Wait for the disk with each scan. Without, a crash of the machine may take the last ones; a crash of the
+                process does not.
+            snapshot_scans, snapshot_bytes: A snapshot is written after so many scans, or so many bytes of the journal.
             max_saved: Copies with a name that may lie in the folder `saved` of all maps.
         Raises:
             StorageError: another server has the folder, or the disk refuses.
@@ -119,7 +121,7 @@ class MapStore:
 
     # --- start ----------------------------------------------------------------------------------------------
 
-    def restore(self, mapper: Mapper) -> Restored:
+    def restore(self, mapper: MappingService) -> Restored:
         """Give an empty mapper the map that is kept: the last snapshot, and the scans of the journal after it.
 
         Raises:
@@ -132,7 +134,7 @@ class MapStore:
         if saved is not None:
             stamps.update(saved.record.stamps)
             self._taken = saved.record.number
-            # scans may be integrated a little otherwise than before, and numbers of revisions must not come twice
+            # a scan that is integrated again may give other last digits: the epoch tells readers that the revision is another
             keeps_epoch = self._journal.was_closed and self._journal.last == self._taken
             epoch = saved.record.epoch if keeps_epoch else secrets.randbits(62)
             self._check_fits(mapper, saved, self._tiles.path)
@@ -173,7 +175,7 @@ class MapStore:
                 reason="damaged",
             )
 
-    def _replay(self, mapper: Mapper, stamps: dict[str, int]) -> int:
+    def _replay(self, mapper: MappingService, stamps: dict[str, int]) -> int:
         n = self._journal.last - self._taken
         if n > 0:
             log.info("journal_replaying", map_id=self._map_id, n_scans=n)
@@ -217,7 +219,7 @@ class MapStore:
         self._health.count("store.appends")
         self._health.observe("journal", (time.perf_counter() - started_s) * 1e3)
 
-    def advance(self, mapper: Mapper, stamps: Mapping[str, int]) -> None:
+    def advance(self, mapper: MappingService, stamps: Mapping[str, int]) -> None:
         """The last scan is in the map; a snapshot is begun if enough have come. Never waits.
 
         Args:
@@ -247,7 +249,7 @@ class MapStore:
                 self._newest = newest
                 self._asked, self._unsaved_bytes = self._number, 0
 
-    def save(self, name: str | None, mapper: Mapper, stamps: Mapping[str, int]) -> str:
+    def save(self, name: str | None, mapper: MappingService, stamps: Mapping[str, int]) -> str:
         """Write a snapshot now, and a file of its own if there is a name; what was done, for people.
 
         Raises:
@@ -267,7 +269,7 @@ class MapStore:
         self._health.count("store.saved")
         return f"{state.n_scans} scans saved as {path}, {n_bytes} bytes"
 
-    def load(self, name: str, mapper: Mapper) -> tuple[MapState, dict[str, int]]:
+    def load(self, name: str, mapper: MappingService) -> tuple[MapState, dict[str, int]]:
         """Read a saved map: the state to replace the present one with, of a new epoch and a higher revision, and its stamps.
 
         Raises:
@@ -350,7 +352,7 @@ class MapStore:
             elapsed_ms=round(elapsed_ms, 1),
         )
 
-    def _check_fits(self, mapper: Mapper, saved: SavedMap, path: Path) -> None:
+    def _check_fits(self, mapper: MappingService, saved: SavedMap, path: Path) -> None:
         r, size_m = saved.record, mapper.settings.tile_size_m
         if r.grid is not None and r.grid[0] != size_m:
             raise MapFileError(
@@ -374,13 +376,13 @@ class MemoryOnly:
     def append(self, scan: Scan) -> None:
         """Nothing to do."""
 
-    def advance(self, mapper: Mapper, stamps: Mapping[str, int]) -> None:
+    def advance(self, mapper: MappingService, stamps: Mapping[str, int]) -> None:
         """Nothing to do."""
 
     def replace(self, state: MapState, stamps: Mapping[str, int]) -> None:
         """Nothing to do."""
 
-    def save(self, name: str | None, mapper: Mapper, stamps: Mapping[str, int]) -> str:
+    def save(self, name: str | None, mapper: MappingService, stamps: Mapping[str, int]) -> str:
         """Not here.
 
         Raises:
@@ -388,7 +390,7 @@ class MemoryOnly:
         """
         raise UnsupportedError(_IN_MEMORY)
 
-    def load(self, name: str, mapper: Mapper) -> tuple[MapState, dict[str, int]]:
+    def load(self, name: str, mapper: MappingService) -> tuple[MapState, dict[str, int]]:
         """Not here.
 
         Raises:

@@ -3,13 +3,12 @@
 head     what the tile is: its index, revision, stamp, and how many rows and kernels follow
 body     the arrays, column by column, each number's bytes apart (all first bytes, then all second ones), deflated: what is
          alike in a column, such as the widths of a lattice's kernels or their places on it, then takes next to nothing
-digest   BLAKE2b of head and body
+seal     of head and body
 """
 
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 import struct
 import zlib
 from typing import Any, NamedTuple
@@ -21,8 +20,8 @@ from potserver.domain.tiles import CARRIED, MapKernels, Tile, TileGrid, TileInde
 from potserver.domain.types import KernelSet
 from potserver.errors import MapFileError, ShapeError
 from potserver.numerics.evidence import Rows
+from potserver.storage.seal import sealed, unsealed
 
-DIGEST_BYTES = 16
 _HEAD = struct.Struct("<3i2q2I")  # index, revision, stamp_ns, rows, kernels
 _LEVEL = 1  # of deflate: the higher ones cost ten times as much for a few per cent
 
@@ -51,14 +50,6 @@ _KERNELS = (
 _MAP_KERNELS = (_Column("level", "|i1", 0), _Column("prior_mean", "<f4", 0), _Column("prior_var", "<f4", 0))
 
 
-def digest_of(*parts: bytes) -> bytes:
-    """What tells a damaged record; not a signature."""
-    state = hashlib.blake2b(digest_size=DIGEST_BYTES)
-    for part in parts:
-        state.update(part)
-    return state.digest()
-
-
 def encode_tile(index: TileIndex, tile: Tile) -> bytes:
     """A tile whose arrays are as `Region.tiles` cuts them."""
     rows, kernels = tile.rows, tile.kernels
@@ -69,7 +60,7 @@ def encode_tile(index: TileIndex, tile: Tile) -> bytes:
     ]
     head = _HEAD.pack(*index, tile.revision, tile.stamp_ns, len(rows.occupied), len(kernels))
     body = zlib.compress(b"".join(columns), _LEVEL)
-    return head + body + digest_of(head, body)
+    return sealed(head + body)
 
 
 def decode_tile(data: bytes, grid: TileGrid, n_robots: int) -> tuple[TileIndex, Tile]:
@@ -82,15 +73,17 @@ def decode_tile(data: bytes, grid: TileGrid, n_robots: int) -> tuple[TileIndex, 
     Raises:
         MapFileError: the bytes are damaged, or no tile of such a map.
     """
-    head, body, digest = data[: _HEAD.size], data[_HEAD.size : -DIGEST_BYTES], data[-DIGEST_BYTES:]
-    if len(data) < _HEAD.size + DIGEST_BYTES or digest_of(head, body) != digest:
+    content = unsealed(data)
+    if content is None or len(content) < _HEAD.size:
         raise MapFileError("a tile's checksum does not fit its content", reason="damaged")
-    x, y, z, revision, stamp_ns, n_rows, n_kernels = _HEAD.unpack(head)
+    x, y, z, revision, stamp_ns, n_rows, n_kernels = _HEAD.unpack_from(content)
     sizes = [(c, n_rows) for c in _ROWS] + [(c, n_kernels) for c in (*_KERNELS, *_MAP_KERNELS)]
     n_bytes = sum(n * max(1, c.width) * np.dtype(c.dtype).itemsize for c, n in sizes)
     try:
         inflate = zlib.decompressobj()
-        plain = inflate.decompress(body, n_bytes + 1)  # one more would show that there is more
+        plain = inflate.decompress(
+            content[_HEAD.size :], n_bytes + 1
+        )  # one more would show that there is more
         if len(plain) != n_bytes or not inflate.eof:
             raise MapFileError(f"tile {(x, y, z)} is not of the size that it says", reason="damaged")
         arrays, start = {}, 0

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from potschemas import keys
-from potserver.atoms.admission import AdmissionSettings, Refusal, admit, own_auc
+from potserver.atoms.admission import Refusal, admit, own_auc
 from potserver.atoms.distance import atom_distances, near_in_spread
 from potserver.domain.dictionary import AtomDictionary
 from potserver.domain.types import Atom, KernelSet
-from potserver.errors import AtomRefusedError, SettingsError
+from potserver.errors import AtomRefusedError
 
 
 @pytest.fixture(scope="module")
@@ -34,9 +34,9 @@ def flat(builtin: AtomDictionary) -> Atom:
     return builtin.of_dims(2).atoms[0]
 
 
-def _refusal(atom: Atom, dictionary: AtomDictionary | None = None, **settings: Any) -> AtomRefusedError:
+def _refusal(atom: Atom, dictionary: AtomDictionary | None = None, **bounds: Any) -> AtomRefusedError:
     with pytest.raises(AtomRefusedError) as caught:
-        admit(atom, dictionary or AtomDictionary(), AdmissionSettings(**settings))
+        admit(atom, dictionary or AtomDictionary(), **bounds)
     return caught.value
 
 
@@ -168,13 +168,6 @@ def test_twins_of_other_dimensions_do_not_count(flat: Atom) -> None:
         _refusal(dataclasses.replace(flat, atom_id="twin"), AtomDictionary([flat])).reason
         == Refusal.DUPLICATE
     )
-
-
-def test_the_settings_are_checked() -> None:
-    with pytest.raises(SettingsError, match=r"atoms\.admission\.min_auc"):
-        AdmissionSettings(min_auc=float("nan"))
-    with pytest.raises(SettingsError, match="max_points"):
-        AdmissionSettings(max_points=-1)
 
 
 def test_own_auc_against_counting_pairs(flat: Atom) -> None:

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import dataclasses
 import threading
 from pathlib import Path
 
 import pytest
 
-from potserver.atoms.admission import AdmissionSettings
 from potserver.atoms.store import AtomStore
 from potserver.domain.dictionary import AtomDictionary
+from potserver.domain.types import Atom
 from potserver.errors import AtomRefusedError, DictionaryError, ReadOnlyError, UnknownAtomError
 
 
@@ -79,21 +78,23 @@ def test_a_disk_that_refuses_changes_nothing(builtin: AtomDictionary, tmp_path: 
 
 def test_many_threads_lose_no_change(builtin: AtomDictionary, tmp_path: Path) -> None:
     file = tmp_path / "d.atoms"
-    lenient = AdmissionSettings(min_distance_m2=0.0)
-    store = AtomStore(AtomDictionary(), lambda _: None, settings=lenient, file=file)
-    flat = builtin.of_dims(2).atoms[0]
+    store = AtomStore(AtomDictionary(), lambda _: None, file=file)
     start = threading.Barrier(8)
+
+    def mine(thread: int) -> tuple[Atom, ...]:
+        return builtin.atoms[4 * thread : 4 * thread + 4]
 
     def add(thread: int) -> None:
         start.wait()
-        for i in range(4):
-            store.add(dataclasses.replace(flat, atom_id=f"a{thread}-{i}"))
-        store.remove(f"a{thread}-0")
+        for atom in mine(thread):
+            store.add(atom)
+        store.remove(mine(thread)[0].atom_id)
 
     threads = [threading.Thread(target=add, args=(i,)) for i in range(8)]
     for thread in threads:
         thread.start()
     for thread in threads:
         thread.join()
-    expected = {f"a{thread}-{i}" for thread in range(8) for i in (1, 2, 3)}
+    expected = {atom.atom_id for thread in range(8) for atom in mine(thread)[1:]}
+    assert len(expected) == 24
     assert set(_ids(store.dictionary)) == set(_ids(AtomDictionary.load(file))) == expected

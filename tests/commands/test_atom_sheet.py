@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from potserver.commands.atom_sheet import _telling_level, _views, choose, draw_sheet
+from potserver.commands.atom_sheet import choose, draw_sheet, slice_level, views_of
 from potserver.domain.dictionary import AtomDictionary
 from potserver.domain.types import Atom, KernelSet
 from potserver.errors import SettingsError, UnknownAtomError
@@ -52,12 +52,12 @@ def test_the_slice_avoids_the_floor() -> None:
         atom_id="a", dims=3, hit_points=np.concatenate([floor, wall]).astype(np.float32),
         free_points=free.astype(np.float32), kernels=KernelSet.empty(), radius_m=20.0, azimuth_width_rad=2.0, provenance={},
     )  # fmt: skip
-    assert -1.5 < _telling_level(atom, across=2) < 1.0
+    assert -1.5 < slice_level(atom, across=2) < 1.0
 
 
 def test_panels_keep_metres_square(builtin: AtomDictionary) -> None:
     for atom in builtin.atoms[::5]:
-        views = _views(atom)
+        views = views_of(atom)
         assert len(views) == (1 if atom.dims == 2 else 2)
         for view in views:
             width, height = view.upper - view.lower

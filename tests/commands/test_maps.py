@@ -16,7 +16,6 @@ from potclient.kernels import KernelSet as ClientKernels
 from potclient.octomap import DEPTH, KEY_ORIGIN, Leaves, OcTreeBuilder, read_bt, write_bt
 from potserver import cli
 from potserver.commands.maps import places_of
-from potserver.domain.kernel_map import KernelMap
 from potserver.errors import SettingsError
 from potserver.health import Health
 from potserver.mapping.service import MappingService
@@ -81,15 +80,18 @@ def test_info_counts_what_is_there(saved: Path, run: Run) -> None:
 def test_info_of_a_store_lists_its_maps_and_their_journals(tmp_path: Path, run: Run) -> None:
     for map_id, n in (("ground", 1), ("roof", 2)):
         service = MappingService(settings=SETTINGS, threads=1)
-        store = MapStore(tmp_path, map_id, keeps_evidence=True, health=Health(), fsync=False)
+        store = MapStore(tmp_path / "store", map_id, keeps_evidence=True, health=Health(), fsync=False)
         store.restore(service)
         store.save("copy" if map_id == "roof" else None, service, {})
         for number in range(n):
             scan = make_scan(number)
             service.integrate(scan, commit=lambda store=store, scan=scan: store.append(scan))
-        store._tiles.close()
-        store._journal.close()  # as a kill would leave them
-    code, out, _ = run("info", tmp_path, "--json")
+        shutil.copytree(
+            tmp_path / "store" / map_id, tmp_path / "killed" / map_id
+        )  # as a kill would leave it now
+        store.close()
+    shutil.copytree(tmp_path / "store" / "saved", tmp_path / "killed" / "saved")
+    code, out, _ = run("info", tmp_path / "killed", "--json")
     assert code == 0
     told = [(each["map"], each.get("scans in the journal")) for each in json.loads(out)]
     assert told == [("ground", 1), ("roof", 2), ("roof", None)]
@@ -134,7 +136,7 @@ def test_what_is_no_map_is_one_line_and_exit_code_two(tmp_path: Path, saved: Pat
 def test_a_saved_map_is_exported_as_it_answers(saved: Path, tmp_path: Path, run: Run) -> None:
     state = read_map(saved).state()
     assert state.tiled is not None
-    whole = KernelMap(list(state.tiled.parts.values()), rule=read_map(saved).record.answer_rule)
+    whole = read_map(saved).kernel_map()
     points = np.random.default_rng(0).uniform(-6, 6, (300, 3))
 
     assert run("export", saved, "-f", "npz", "-o", tmp_path / "a.npz", "-q")[0] == 0
@@ -218,9 +220,7 @@ def test_an_octomap_comes_back_as_a_map_that_agrees(tmp_path: Path, run: Run) ->
     assert saved.record.robots == ["small-room"]
     assert saved.record.keeps_evidence
     assert saved.tiled is not None
-    answer = KernelMap(list(saved.tiled.parts.values()), rule=saved.record.answer_rule).occupancy(
-        (keys + 0.5) * 0.2
-    )
+    answer = saved.kernel_map().occupancy((keys + 0.5) * 0.2)
     assert answer.observed.all()
     assert ((answer.mean > 0.5) == wall).mean() > 0.95
     service = MappingService(settings=SETTINGS, threads=1)
@@ -237,7 +237,7 @@ def test_kernels_come_back_as_they_answer(tmp_path: Path, saved: Path, run: Run)
     assert not again.record.keeps_evidence
     points = np.random.default_rng(1).uniform(-6, 6, (300, 3))
     kernels = ClientKernels.load(tmp_path / "a.npz")
-    found = KernelMap(list(again.tiled.parts.values()), rule=again.record.answer_rule)
+    found = again.kernel_map()
     np.testing.assert_allclose(found.occupancy(points).mean, kernels.occupancy(points).mean, atol=1e-4)
     assert "profile paper" in run("info", tmp_path / "a.map")[1]
     paper = MappingService(settings=MappingSettings.of_profile("paper"), threads=1)
@@ -255,9 +255,9 @@ def test_a_snapshot_is_rescued_from_a_store(tmp_path: Path, run: Run) -> None:
         if number == 1:
             store.save(None, service, {"r1": scan.stamp_ns})
             first = service.state
-    store._tiles.close()
-    store._journal.close()
-    code, out, _ = run("import", tmp_path / "store" / "default", "-o", tmp_path / "rescued.map")
+    shutil.copytree(tmp_path / "store", tmp_path / "killed")  # as a kill would leave it now
+    store.close()
+    code, out, _ = run("import", tmp_path / "killed" / "default", "-o", tmp_path / "rescued.map")
     assert code == 0
     assert "1 scans of the journal are not in it" in out
     rescued = read_map(tmp_path / "rescued.map")

@@ -7,8 +7,8 @@ import json
 import logging
 import os
 import signal
+import subprocess
 import sys
-import types
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,9 @@ import pytest
 from potclient.atoms import Atom
 from potserver import cli
 from potserver.adapters.log import configure_logging, get_logger
-from potserver.config import Settings, load_settings
+from potserver.commands.config import to_toml
+from potserver.commands.serve import StopSignals
+from potserver.config import Leaf, Settings, as_tree, load_settings
 from potserver.domain.dictionary import AtomDictionary
 
 
@@ -49,10 +51,51 @@ def show(capsys: pytest.CaptureFixture[str], *flags: str) -> dict[str, Any]:
 def test_config_show_prints_a_file_that_can_be_read_back(
     capsys: pytest.CaptureFixture[str], tmp_path: Any
 ) -> None:
-    assert cli.main(["config", "show", "--map", "a", "--map", "b"]) == 0
+    flags = [
+        "--map",
+        "a",
+        "--map",
+        "b",
+        "--cfg",
+        'connect/endpoints:["tcp/h:3"]',
+        "--dictionary",
+        'a "b".atoms',
+    ]
+    assert cli.main(["config", "show", "--in-memory", *flags]) == 0
     file = tmp_path / "settings.toml"
     file.write_text(capsys.readouterr().out)
-    assert load_settings(file=file).maps == ("a", "b")
+    assert cli.main(["config", "show", "--json", "--in-memory", *flags]) == 0
+    assert as_tree(load_settings(file=file)) == json.loads(capsys.readouterr().out)
+
+
+def test_config_show_marks_what_is_not_at_its_default(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["config", "show", "--map", "a", "--threads", "2", "--in-memory"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    changed = [line for line in lines if "changed" in line]
+    assert changed == [
+        'maps = ["a"]  # changed; the default is ["default"]',
+        "threads = 2  # changed; the default is none",
+        'directory = ""  # changed; the default is none',
+    ]
+    assert {"[limits]", 'server_id = "potserver"', "# dictionary ="} <= set(lines)
+
+
+def test_what_a_setting_is_stands_above_it() -> None:
+    leaves = [
+        Leaf("root", "pot/v1", "pot/v1", "text", "first chunks of all keys"),
+        Leaf("zenoh.cfg", {"a/b": 5}, {}, "table", "Zenoh keys"),
+        Leaf("zenoh.mode", None, "peer", "text", ""),
+    ]
+    assert to_toml(leaves).splitlines() == [
+        "# first chunks of all keys (text)",
+        'root = "pot/v1"',
+        "",
+        "[zenoh]",
+        "# Zenoh keys (table)",
+        'cfg = {"a/b" = 5}  # changed; the default is {}',
+        "# text",
+        '# mode =  # changed; the default is "peer"',
+    ]
 
 
 def test_flags_become_settings(capsys: pytest.CaptureFixture[str]) -> None:
@@ -71,7 +114,6 @@ def test_flags_become_settings(capsys: pytest.CaptureFixture[str]) -> None:
         "config": "z.json5",
         "cfg": {"transport/link/tx/lease": "5000", "connect/endpoints": '["tcp/h:3"]'},
         "shared_memory": False,
-        "shared_memory_queries": False,
     }
     assert (tree["server_id"], tree["root"], tree["threads"]) == ("s1", "r", 2)
     assert (tree["drain_timeout_s"], tree["dictionary"]) == (3.0, "d.npz")
@@ -82,16 +124,16 @@ def test_flags_become_settings(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_variables_are_read(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("POTSERVER_SEED", "9")
-    assert show(capsys)["seed"] == 9
-    assert show(capsys, "--set", "seed=10")["seed"] == 10
+    monkeypatch.setenv("POTSERVER_THREADS", "9")
+    assert show(capsys)["threads"] == 9
+    assert show(capsys, "--set", "threads=10")["threads"] == 10
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
         (["config", "show", "--set", "nothing=1"], "no setting 'nothing'"),
-        (["config", "show", "--set", "seed"], "need KEY=VALUE"),
+        (["config", "show", "--set", "threads"], "need KEY=VALUE"),
         (["config", "show", "--cfg", "mode"], "need KEY:VALUE"),
         (["config", "show", "--settings", "/no/such.toml"], "cannot read settings file"),
         (["config", "show", "--root", "**"], "chunks"),
@@ -101,8 +143,10 @@ def test_variables_are_read(capsys: pytest.CaptureFixture[str], monkeypatch: pyt
         (["atoms", "export", "nope", "-o", "x"], "no atom 'nope'"),
         (["atoms", "import", "/no/such.atom", "-o", "/no/such.atoms"], "cannot read /no/such.atom"),
         (["config", "show", "--set", "atoms.save=true"], "need the setting `dictionary`"),
-        (["config", "show", "--set", "atoms.admission.min_auc=nan"], "atoms.admission.min_auc"),
+        (["config", "show", "--set", "atoms.admission.min_auc=1"], "atoms.admission"),
         (["serve", "--map", "A"], "is not an id"),
+        (["demo", "--profile", "none"], "need one of default, paper"),
+        (["demo", "/no/such/recording"], "/no/such/recording"),
     ],
 )
 def test_a_mistake_is_one_line_and_exit_code_two(
@@ -128,7 +172,13 @@ def test_a_mistake_is_one_line_and_exit_code_two(
         ["atoms", "build"],
         ["atoms", "export"],
         ["atoms", "import"],
+        ["map"],
+        ["map", "info"],
+        ["map", "export"],
+        ["map", "import"],
+        ["map", "merge"],
         ["eval"],
+        ["demo"],
     ],
 )
 def test_help_is_there_at_every_level(capsys: pytest.CaptureFixture[str], words: list[str]) -> None:
@@ -190,18 +240,23 @@ def test_atoms_leave_a_dictionary_and_come_back(capsys: pytest.CaptureFixture[st
     assert target.read_bytes() == before
 
 
-def test_demo_is_handed_its_arguments(monkeypatch: pytest.MonkeyPatch) -> None:
-    seen: list[list[str]] = []
-    demo = types.ModuleType("potserver.commands.demo")
-    demo.main = lambda arguments: seen.append(arguments)  # type: ignore[attr-defined]
-    monkeypatch.setitem(sys.modules, "potserver.commands.demo", demo)
-    assert cli.main(["demo", "--help", "-x"]) == 0
-    assert seen == [["--help", "-x"]]
+@pytest.mark.parametrize("words", [[], ["serve"], ["atoms", "build"], ["map", "export"], ["eval"], ["demo"]])
+def test_help_loads_none_of_the_numerics(words: list[str]) -> None:
+    code = (
+        "import runpy, sys\n"
+        f"sys.argv = ['potserver', *{words!r}, '--help']\n"
+        "try:\n    runpy.run_module('potserver', run_name='__main__')\n"
+        "finally:\n    print('loaded:', *sorted({'numba', 'torch', 'open3d', 'matplotlib'} & set(sys.modules)))"
+    )
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    assert run.returncode == 0, run.stderr
+    assert run.stdout.startswith(f"usage: {' '.join(['potserver', *words])} ")
+    assert run.stdout.splitlines()[-1] == "loaded:"
 
 
 def test_the_first_signal_sets_a_flag_and_handlers_are_put_back() -> None:
     before = signal.getsignal(signal.SIGTERM), signal.getsignal(signal.SIGINT)
-    with cli._StopSignals.installed() as stop:
+    with StopSignals.installed() as stop:
         assert stop.name is None
         signal.raise_signal(signal.SIGTERM)
         stop.wait()
@@ -239,8 +294,6 @@ def test_on_a_console_they_are_for_people() -> None:
 
 
 def test_the_settings_that_are_logged_are_json() -> None:
-    from potserver.config import as_tree
-
     json.dumps(as_tree(Settings()))
 
 

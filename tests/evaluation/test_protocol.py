@@ -10,15 +10,14 @@ import pytest
 
 from potclient.datasets import RecordedScan, Recording, open_dataset
 from potclient.holdout import HoldOut
-from potserver import AtomDictionary, MappingSettings, cli
-from potserver.atoms.build.scan_task import to_scan
+from potserver import AtomDictionary, MappingService, MappingSettings, cli
 from potserver.commands.eval import to_markdown
 from potserver.domain.kernel_map import KernelMap
 from potserver.errors import EmptyError
-from potserver.evaluation.ablations import ABLATIONS
+from potserver.evaluation.ablations import ABLATIONS, label_of
 from potserver.evaluation.mappers import Mapper, ServiceMap, Size, kernel_bytes
 from potserver.evaluation.protocol import evaluate
-from potserver.mapping.service import MappingService
+from potserver.recordings import to_scan
 
 WALL_M = 4.0
 
@@ -192,10 +191,7 @@ def test_towns_are_asked_about_their_truth() -> None:
 
 def test_ablations_are_what_their_names_say() -> None:
     assert list(ABLATIONS) == ["POT, not refined", "RePOT, transported prior", "RePOT, flat prior"]
-    rows = {
-        name: MappingService(threads=2, make_pipeline=make_pipeline)
-        for name, make_pipeline in ABLATIONS.items()
-    }
+    rows = {name: MappingService(threads=2, make_pipeline=pipeline) for name, pipeline in ABLATIONS.items()}
     updates = {name: service.integrate(to_scan(Wall()[0], 0)) for name, service in rows.items()}
     pot, repot, flat = updates.values()
     assert not rows["POT, not refined"].keeps_evidence
@@ -210,8 +206,20 @@ def test_ablations_are_what_their_names_say() -> None:
     np.testing.assert_array_equal(priors["RePOT, flat prior"], 0.0)
 
 
+def test_ablations_of_another_profile_are_refused() -> None:
+    assert cli.main(["eval", "bundled:plan", "--profile", "paper", "--ablations"]) == 2
+
+
+def test_a_label_says_what_ran() -> None:
+    assert label_of(MappingSettings()) == "default"
+    assert label_of(MappingSettings.of_profile("paper")) == "paper"
+    assert (
+        label_of(MappingSettings(fade_rate=0.0, max_range_m=9.0)) == "default, max_range_m=9.0, fade_rate=0.0"
+    )
+
+
 def test_our_map_is_the_services() -> None:
-    service = ServiceMap("ours", MappingSettings(), AtomDictionary(), threads=1)
+    service = ServiceMap("ours", MappingService(AtomDictionary(), MappingSettings(), threads=1))
     timings = service.integrate(Wall()[0])
     assert timings.keys() >= {"label", "fuse"}
     size = service.size()

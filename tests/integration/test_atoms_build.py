@@ -51,7 +51,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def _command(folder: Path, out: str, *flags: str, recipe: str = "site.toml") -> list[str]:
     files = ["--recipe", str(folder / recipe), "-o", str(folder / out)]
-    return [sys.executable, "-m", "potserver.cli", "atoms", "build", *files, *flags]
+    return [sys.executable, "-m", "potserver", "atoms", "build", *files, *flags]
 
 
 def _build(folder: Path, out: str, *flags: str, padding: int = 0) -> subprocess.CompletedProcess[str]:

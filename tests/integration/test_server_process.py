@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 import contextlib
-import json
-import os
-import queue
 import signal
 import subprocess
 import sys
-import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from benchmarks.server_process import ServerProcess
 from potschemas import wire
 from potschemas.messages import ReceiptStatus
 
@@ -24,63 +21,15 @@ from .conftest import DEADLINE_S, Client, make_cloud, until
 START_S = 120.0  # the first start on a machine compiles
 
 
-class Process:
-    """A `potserver` command whose JSON log is read as it comes."""
-
-    def __init__(self, *arguments: str) -> None:
-        environ = {k: v for k, v in os.environ.items() if not k.startswith(("POTSERVER_", "ZENOH_"))}
-        self.popen = subprocess.Popen(
-            [sys.executable, "-m", "potserver.cli", *arguments],
-            stderr=subprocess.PIPE,
-            stdout=subprocess.DEVNULL,
-            text=True,
-            env=environ,
-        )
-        self.lines: list[str] = []
-        self._events: queue.Queue[dict[str, Any]] = queue.Queue()
-        self._reader = threading.Thread(target=self._read, daemon=True)
-        self._reader.start()
-
-    def _read(self) -> None:
-        assert self.popen.stderr is not None
-        for line in self.popen.stderr:
-            self.lines.append(line)
-            with contextlib.suppress(ValueError):
-                self._events.put(json.loads(line))
-
-    def event(self, name: str, timeout_s: float = DEADLINE_S) -> dict[str, Any]:
-        """Wait for an event of the log."""
-        while True:
-            try:
-                event = self._events.get(timeout=timeout_s)
-            except queue.Empty:
-                raise AssertionError(f"no event {name}:\n" + "".join(self.lines)) from None
-            if event["event"] == name:
-                return event
-
-    def wait(self) -> int:
-        """The exit code."""
-        code = self.popen.wait(DEADLINE_S)
-        self._reader.join(DEADLINE_S)
-        return code
-
-    def close(self) -> None:
-        if self.popen.poll() is None:
-            self.popen.kill()
-        self.wait()
-        assert self.popen.stderr is not None
-        self.popen.stderr.close()
-
-
 @pytest.fixture
 def serve(tmp_path: Path) -> Iterator[Any]:
     """Starts `potserver serve` and waits until it is ready."""
     with contextlib.ExitStack() as stack:
 
-        def start(*arguments: str, ready: bool = True) -> tuple[Process, str]:
+        def start(*arguments: str, ready: bool = True) -> tuple[ServerProcess, str]:
             file = tmp_path / "settings.toml"
             file.write_text("[mapping]\nmax_range_m = 15.0\nbeams_per_scan = 500\n")
-            process = Process(
+            process = ServerProcess(
                 "serve",
                 "--in-memory",
                 "--settings",
@@ -149,7 +98,7 @@ def test_a_program_that_forgets_to_stop_still_ends() -> None:
 
 def test_a_taken_port_is_one_line_and_exit_code_two(serve: Any) -> None:
     process, endpoint = serve()
-    other = Process("serve", "--in-memory", "--listen", endpoint, "--log-level", "error")
+    other = ServerProcess("serve", "--in-memory", "--listen", endpoint, "--log-level", "error")
     assert other.wait() == 2
     other.close()
     (line,) = other.lines

@@ -34,7 +34,7 @@ from potserver.mapping.settings import MappingSettings
 from potserver.storage.journal import Journal
 from potserver.storage.map_file import MapFile, Origin, read_map, write_map
 from potserver.storage.map_store import JOURNAL, TILES, MapStore, MemoryOnly, Restored
-from potserver.storage.tile_codec import DIGEST_BYTES, digest_of
+from potserver.storage.seal import sealed, unsealed
 
 from .test_tile_codec import assert_same
 
@@ -574,10 +574,10 @@ def test_a_file_whose_rule_is_none_is_damaged(tmp_path: Path) -> None:
     write_map(path, _other_state(), Origin("default", True, {}))
     with sqlite(path) as connection:
         ((record,),) = connection.execute("SELECT record FROM map").fetchall()
-        content = json.loads(record[:-DIGEST_BYTES])
+        content = json.loads(unsealed(record))
         content["rule"][1] = -1.0
         changed = json.dumps(content).encode()
-        connection.execute("UPDATE map SET record = ?", (changed + digest_of(changed),))
+        connection.execute("UPDATE map SET record = ?", (sealed(changed),))
     with pytest.raises(MapFileError, match="prior_var") as refused:
         read_map(path)
     assert refused.value.reason == "damaged"

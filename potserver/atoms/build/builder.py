@@ -10,11 +10,12 @@ from pathlib import Path
 
 from potclient.errors import DatasetError
 from potserver.atoms.build.engines import Engine
-from potserver.atoms.build.recipe import Recipe, located, open_recording
+from potserver.atoms.build.recipe import Recipe, located
 from potserver.atoms.build.scan_task import Candidate, Progress, ScanResult, ScanTask, learn_scan
 from potserver.atoms.cover import greedy_cover
 from potserver.domain.dictionary import AtomDictionary
 from potserver.errors import DictionaryError
+from potserver.recordings import open_recording
 
 COVERED = "near a kept atom"
 OVER_LIMIT = "beyond max_atoms"

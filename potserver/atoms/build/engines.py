@@ -21,9 +21,7 @@ T = TypeVar("T")
 R = TypeVar("R")
 
 LOCAL_RAY = "local"
-_TASKS_A_WORKER = (
-    3  # handed out at once: enough that no worker waits for the slowest one, and few results are held
-)
+_TASKS_A_WORKER = 3  # handed out at once: no worker waits for the slowest one, and few results are held
 # one thread a task, so that sums do not depend on the machine; read by the libraries when a worker loads them
 _ONE_THREAD = {
     f"{library}_NUM_THREADS": "1" for library in ("OMP", "MKL", "OPENBLAS", "NUMBA", "VECLIB_MAXIMUM")
@@ -125,7 +123,7 @@ class _Processes:
                 return self._pool.submit(function, task)
 
         try:
-            yield from _in_order(
+            yield from in_order(
                 submit, lambda future: future.result(), tasks, _TASKS_A_WORKER * self._workers
             )
         except BrokenProcessPool as error:
@@ -142,14 +140,14 @@ class _Ray:
         ahead = _TASKS_A_WORKER * max(1, int(self._ray.cluster_resources().get("CPU", 1)))
         remote = self._ray.remote(num_cpus=1)(function)
         try:
-            yield from _in_order(remote.remote, self._ray.get, tasks, ahead)
+            yield from in_order(remote.remote, self._ray.get, tasks, ahead)
         except self._ray.exceptions.RayTaskError:
             raise  # a bug of ours; it looks like the error that it wraps
         except self._ray.exceptions.RayError as error:
             raise DictionaryError(f"Ray gave a task up: {error}") from error
 
 
-def _in_order(
+def in_order(
     submit: Callable[[T], Any], result_of: Callable[[Any], R], tasks: Iterable[T], ahead: int
 ) -> Iterator[R]:
     """Hand out tasks, `ahead` at most at a time, and give back their results in order."""

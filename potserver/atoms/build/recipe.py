@@ -14,33 +14,17 @@ from typing import Annotated, Any, Literal
 
 import msgspec
 
-from potclient.datasets import Recording, open_dataset
-from potclient.errors import DatasetError
-from potserver import bundled
 from potserver.atoms.learning import LearningSettings
 from potserver.errors import SettingsError
+from potserver.recordings import BUNDLED_PREFIX, Reader, scan_numbers
 
 tomllib: Any = importlib.import_module("tomllib" if sys.version_info >= (3, 11) else "tomli")
 
 BUILTIN_RECIPE = "builtin_atoms.toml"
 SHARE_OF_RADIUS = 0.15  # of an atom's radius: the tolerance where none is stated
-_BUNDLED_PREFIX = "bundled:"
-_SLICE = re.compile(r"(\d*)(:)(\d*)(?::([1-9]\d*))?\Z")
 
 _AtLeastOne = Annotated[int, msgspec.Meta(ge=1)]
 _NotNegative = Annotated[float, msgspec.Meta(ge=0.0)]
-
-
-class Reader(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """How a recording is opened: the options of `potclient.datasets.open_dataset`."""
-
-    format: str = "auto"
-    poses: str | None = None
-    frame: str = "auto"
-    no_return_m: float | None = None
-    min_range_m: float = 0.0
-    max_range_m: float | None = None
-    n_generated: _AtLeastOne = 100  # scans of a made-up recording
 
 
 class Quality(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -55,14 +39,12 @@ class RecordingRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_
     """One recording, and what differs for it from the recipe's own settings."""
 
     dataset: str  # a path, `bundled:NAME`, or anything else that `open_dataset` knows
-    name: Annotated[str, msgspec.Meta(pattern=r"^[a-z0-9][a-z0-9_.-]{0,39}$")] | None = (
-        None  # prefix of the atoms' ids; default: from the dataset
-    )
+    # prefix of the atoms' ids; default: from the dataset
+    name: Annotated[str, msgspec.Meta(pattern=r"^[a-z0-9][a-z0-9_.-]{0,39}$")] | None = None
     licence: str = "not stated"
     scans: int | str = ":"  # the first N, or START:STOP:STEP
-    window: _AtLeastOne = (
-        1  # scans, from each taken one on, that are learned together; a 2D scan alone shows little
-    )
+    # scans, from each taken one on, that are learned together; a 2D scan alone shows little
+    window: _AtLeastOne = 1
     dims: Literal[2, 3] | None = None  # what its scans must have
     max_atoms: _AtLeastOne | None = None  # kept of this recording
     tolerance_m: _NotNegative | None = None
@@ -75,17 +57,14 @@ class RecordingRecipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_
         if self.name is not None:
             return self.name
         if _is_spec(self.dataset):
-            parts = self.dataset.removeprefix(_BUNDLED_PREFIX).split(":")
+            parts = self.dataset.removeprefix(BUNDLED_PREFIX).split(":")
         else:
             parts = list(Path(self.dataset).resolve().with_suffix("").parts[-2:])
         return re.sub(r"[^a-z0-9.-]+", "-", "-".join(parts).lower()).strip("-.")[:40]
 
     def numbers(self, n_scans: int) -> range:
         """The scans that are taken of a recording of `n_scans`."""
-        if isinstance(self.scans, int):
-            return range(min(self.scans, n_scans))
-        start, _, stop, step = _SLICE.match(self.scans).groups()  # type: ignore[union-attr] # checked when read
-        return range(n_scans)[int(start or 0) : int(stop or n_scans) : int(step or 1)]
+        return scan_numbers(self.scans, n_scans)
 
 
 class Recipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -146,10 +125,7 @@ def parse_recipe(tree: Mapping[str, Any], source: str) -> Recipe:
         recipe = msgspec.convert(tree, Recipe, strict=True)
         for recording in recipe.recordings:
             recipe.learner_of(recording)
-            if isinstance(recording.scans, int) and recording.scans < 1:
-                raise SettingsError(f"scans = {recording.scans}: need at least 1")
-            if isinstance(recording.scans, str) and not _SLICE.match(recording.scans):
-                raise SettingsError(f"scans = {recording.scans!r}: need a number, or START:STOP:STEP")
+            recording.numbers(0)
     except (msgspec.ValidationError, SettingsError) as error:
         raise SettingsError(f"{source}: {error}") from error
     names = [recording.prefix for recording in recipe.recordings]
@@ -179,34 +155,16 @@ def learning_settings(values: Mapping[str, Any]) -> LearningSettings:
 
 def located(recording: RecordingRecipe, folder: Path) -> RecordingRecipe:
     """The same recording with its relative paths, which start at the recipe's folder, made absolute."""
-    poses = recording.reader.poses
-    return msgspec.structs.replace(
-        recording,
-        dataset=recording.dataset
-        if _is_spec(recording.dataset)
-        else str((folder / recording.dataset).resolve()),
-        reader=msgspec.structs.replace(
-            recording.reader, poses=poses if poses is None else str((folder / poses).resolve())
-        ),
-    )
 
+    def at(path: str) -> str:
+        return str((folder / path).resolve())
 
-def open_recording(dataset: str, reader: Reader) -> Recording:
-    """Open what `dataset` names.
-
-    Raises:
-        DatasetError: nothing there, not recognised, or damaged.
-    """
-    if not dataset.startswith(_BUNDLED_PREFIX):
-        return open_dataset(dataset, **msgspec.structs.asdict(reader))
-    if reader != Reader():
-        raise DatasetError(f"{dataset}: bundled recordings take no reader options")
-    name = dataset.removeprefix(_BUNDLED_PREFIX)
-    try:
-        return bundled.open_bundled(name)
-    except KeyError:
-        names = ", ".join(bundled.NAMES)
-        raise DatasetError(f"no bundled recording {name!r}; there are {names}") from None
+    dataset, reader = recording.dataset, recording.reader
+    if not _is_spec(dataset):
+        dataset = at(dataset)
+    if reader.poses is not None:
+        reader = msgspec.structs.replace(reader, poses=at(reader.poses))
+    return msgspec.structs.replace(recording, dataset=dataset, reader=reader)
 
 
 def _is_spec(dataset: str) -> bool:

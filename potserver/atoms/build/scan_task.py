@@ -18,12 +18,13 @@ from potclient.errors import DatasetError
 from potclient.holdout import HoldOut, LabelledPoints
 from potclient.metrics import Metrics, score
 from potschemas import __version__
-from potserver.atoms.build.recipe import Quality, Reader, open_recording
+from potserver.atoms.build.recipe import Quality
 from potserver.atoms.learning import LearningSettings, SectorEpoch, learn_atoms
 from potserver.domain.kernel_map import KernelMap
-from potserver.domain.types import Atom, Scan
+from potserver.domain.types import Atom
 from potserver.errors import PotserverError, SolverError
-from potserver.numerics.geometry import in_sector, rotation_z, sector_edges, yaw_of
+from potserver.mapping.sectors import SectorCut, sector_frames
+from potserver.recordings import Reader, open_recording, to_scan
 
 NOT_JUDGED = "too few held-out points to judge it"
 
@@ -143,7 +144,7 @@ def _opened(dataset: str, reader: Reader) -> Recording:
 
 
 def _held_out_of(recording: Recording, numbers: tuple[int, ...]) -> list[LabelledPoints]:
-    """What the held-out beams of some scans say; one that cannot be read is its own task's failure, and left out here."""
+    """What the held-out beams of some scans say. A scan that cannot be read is left out: its own task reports it."""
     found = []
     for number in numbers:
         with contextlib.suppress(DatasetError, OSError):
@@ -178,16 +179,17 @@ class SectorOf(NamedTuple):
 
     def pick(self, labels: LabelledPoints) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
         """The points that lie in it, (N, 3) m in the atom's frame, and which are occupied, (N,)."""
-        low, high = sector_edges(self.settings.n_sectors)[self.number : self.number + 2]
-        bisector = yaw_of(self.recorded.T_map_sensor) + (low + high) / 2.0
-        local = (labels.points - self.recorded.T_map_sensor[:3, 3]) @ rotation_z(bisector)
-        half = (high - low) / 2.0
-        inside = in_sector(local, -half, half, self.settings.max_range_m)
-        return local[inside], labels.occupied[inside]
+        pose = self.recorded.T_map_sensor
+        frame = sector_frames(pose, self.settings.max_range_m, SectorCut(self.settings.n_sectors))[
+            self.number
+        ]
+        about_sensor = labels.points - pose[:3, 3]
+        inside = frame.inside(about_sensor)
+        return frame.local(about_sensor[inside]), labels.occupied[inside]
 
 
 def _means_alone(hinge: NDArray[Any], gamma: NDArray[Any], weight: NDArray[Any]) -> KernelMap:
-    """A map that answers with the means: how much a map doubts its weights is its own affair."""
+    """A map that answers with the means of the weights, without their variances."""
     return KernelMap.from_arrays(hinge, gamma, weight, np.zeros(len(weight)))
 
 
@@ -232,16 +234,3 @@ def _written(when: str, scores: Metrics) -> dict[str, str]:
         f"{when}_nll": f"{scores.nll:.4f}",
         f"{when}_ece": f"{scores.ece:.4f}",
     }
-
-
-def to_scan(recorded: RecordedScan, seq: int) -> Scan:
-    """A recorded scan as the mapper takes it."""
-    return Scan(
-        robot_id="recording",
-        seq=seq,
-        stamp_ns=recorded.stamp_ns,
-        points=recorded.points,
-        is_return=recorded.is_return,
-        T_map_sensor=recorded.T_map_sensor,
-        is_planar=recorded.is_planar,
-    )

@@ -19,13 +19,14 @@ from potclient.datasets import open_dataset
 from potclient.holdout import HoldOut
 from potclient.metrics import score
 from potschemas import __version__
+from potserver import cli
 from potserver.atoms import learning
 from potserver.atoms.build import scan_task
 from potserver.atoms.build.builder import COVERED, OVER_LIMIT, Built, build, scan_tasks
-from potserver.atoms.build.engines import _in_order, processes, ray_cluster
+from potserver.atoms.build.engines import in_order, processes, ray_cluster
 from potserver.atoms.build.recipe import Recipe, parse_recipe
 from potserver.atoms.build.scan_task import NOT_JUDGED, Progress, ScanResult, ScanTask, learn_scan
-from potserver.commands import atoms_build as command
+from potserver.commands.atoms_build import recipe_of
 from potserver.domain.kernel_map import KernelMap
 from potserver.errors import DictionaryError, SolverError
 from potserver.numerics.geometry import in_sector, rotation_z, yaw_of
@@ -298,14 +299,14 @@ def _flags(*datasets: str, **changes: Any) -> argparse.Namespace:
 
 
 def test_flags_spell_out_a_recipe() -> None:
-    made, folder = command._recipe(
+    made, folder = recipe_of(
         _flags("a/b", "c/d", scans="4", tolerance=1.5, max_atoms=7, licence="MIT", learner=["n_sectors=8"])
     )
     assert folder == Path.cwd()
     assert (made.tolerance_m, made.max_atoms) == (1.5, 7)
-    assert [(r.dataset, r.scans, r.licence) for r in made.recordings] == [
-        ("a/b", 4, "MIT"),
-        ("c/d", 4, "MIT"),
+    assert [(r.dataset, r.numbers(9), r.licence) for r in made.recordings] == [
+        ("a/b", range(4), "MIT"),
+        ("c/d", range(4), "MIT"),
     ]
     assert made.learner_of(made.recordings[0]).n_sectors == 8
 
@@ -313,18 +314,19 @@ def test_flags_spell_out_a_recipe() -> None:
 @pytest.mark.parametrize(
     ("flags", "message"),
     [
-        (_flags(), "name recordings"),
-        (_flags("a/b", builtin=True), "not two of them"),
-        (_flags(builtin=True, recipe="r.toml"), "not two of them"),
-        (_flags(builtin=True, tolerance=1.0), "tolerance_m: stated by the recipe"),
-        (_flags("a/b", learner=["n_sectors"]), "need KEY=VALUE"),
-        (_flags("bundled:plan", workers=0), "--workers 0"),
-        (_flags("bundled:plan", out="/no/such/folder/x.atoms"), "no folder"),
+        ([], "name recordings"),
+        (["a/b", "--builtin"], "not two of them"),
+        (["--builtin", "--recipe", "r.toml"], "not two of them"),
+        (["--builtin", "--tolerance", "1"], "tolerance_m: stated by the recipe"),
+        (["a/b", "--learner", "n_sectors"], "need KEY=VALUE"),
+        (["bundled:plan", "--workers", "0"], "--workers 0"),
+        (["bundled:plan", "--watch", "--workers", "2"], "in this process alone"),
+        (["bundled:plan", "-o", "/no/such/folder/x.atoms"], "no folder"),
     ],
 )
-def test_wrong_flags(flags: argparse.Namespace, message: str) -> None:
-    with pytest.raises(DictionaryError, match=message):
-        command.run(flags)
+def test_wrong_flags(flags: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["atoms", "build", "-o", "x.atoms", *flags]) == 2
+    assert message in capsys.readouterr().err
 
 
 # --- engines ------------------------------------------------------------------------------------------------
@@ -345,7 +347,7 @@ def test_results_come_in_order_and_few_are_held(ahead: int) -> None:
         held -= 1
         return handle * 10
 
-    assert list(_in_order(submit, result_of, range(7), ahead)) == [10 * i for i in range(7)]
+    assert list(in_order(submit, result_of, range(7), ahead)) == [10 * i for i in range(7)]
     assert most == min(ahead, 7)
 
 

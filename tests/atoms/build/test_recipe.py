@@ -7,19 +7,16 @@ from typing import Any
 
 import pytest
 
-from potclient.errors import DatasetError
-from potserver import bundled
 from potserver.atoms.build.recipe import (
     SHARE_OF_RADIUS,
-    Reader,
     RecordingRecipe,
     builtin_recipe,
     located,
-    open_recording,
     parse_recipe,
     read_recipe,
 )
 from potserver.errors import SettingsError
+from potserver.recordings import Reader, open_recording
 
 ROOMS = {"dataset": "bundled:rooms"}
 
@@ -126,14 +123,3 @@ def test_a_recording_overrides_the_recipe() -> None:
     assert recipe.learner_of(generated).n_sectors == 4
     assert recipe.tolerance_of(generated, 20.0) == 0.5
     assert recipe.tolerance_of(rooms, 20.0) == SHARE_OF_RADIUS * 20.0
-
-
-def test_opening(tmp_path: Path) -> None:
-    assert len(open_recording("bundled:rooms", Reader())) == len(bundled.open_bundled("rooms"))
-    assert len(open_recording("generated:2d", Reader(n_generated=7))) == 7
-    with pytest.raises(DatasetError, match=r"no bundled recording .*; there are street, rooms, plan"):
-        open_recording("bundled:moon", Reader())
-    with pytest.raises(DatasetError, match="no reader options"):
-        open_recording("bundled:rooms", Reader(max_range_m=3.0))
-    with pytest.raises(DatasetError, match="no such file"):
-        open_recording(str(tmp_path / "none"), Reader())

@@ -1,0 +1,115 @@
+"""`potserver serve`: maps for robots and planners, until a signal comes."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import os
+import select
+import signal
+import sys
+from collections.abc import Iterator
+from types import FrameType
+from typing import Any
+
+from potserver.commands.shared import (
+    EXIT_FORCED,
+    EXIT_OK,
+    EXIT_UNCLEAN,
+    add_settings_flags,
+    add_verb,
+    settings_of,
+)
+
+_ABOUT = """\
+Serve maps to robots and planners over Eclipse Zenoh.
+
+The server listens on tcp/127.0.0.1:7447 only. It needs no router: robots connect to it in client mode.
+It is ready when it logs server_started, and when its liveliness token is up.
+Its maps survive restarts and crashes: every accepted cloud is on the disk before its receipt. server_started says
+where they are kept (--store) and how many clouds each holds. One server a store.
+Anyone who reaches the port may write: use Zenoh's access control and TLS.
+SIGTERM or Ctrl-C drains it: waiting clouds are mapped, everybody gets an answer, exit code 0. A second one
+ends it at once."""
+
+_EXAMPLES = """\
+examples:
+  potserver serve                                        one map, `default`, for this machine only
+  potserver serve --listen tcp/0.0.0.0:7447              for the network: who reaches the port may write
+  potserver serve --map ground --map first_floor         two maps, each with its own writer
+  potserver serve --listen tcp/127.0.0.1:0               any free port; the log says which
+  potserver serve --store /var/lib/site/maps             keep the maps there; --in-memory: forget them at the end
+  potserver serve --connect tcp/router:7447 --listen tcp/127.0.0.1:7448
+                                                         join a Zenoh router (ROS 2 hosts have one on 7447)
+  potserver serve --settings site.toml --set limits.max_cloud_points=100000
+  POTSERVER_MAPS=ground,roof potserver serve             every setting is also a variable
+
+settings: defaults < --settings FILE < POTSERVER_* < flags. See them all with `potserver config show`."""
+
+
+def add(commands: Any) -> None:
+    """Add the verb."""
+    parser = add_verb(
+        commands, "serve", _run, help="serve maps until a signal comes", description=_ABOUT, epilog=_EXAMPLES
+    )
+    add_settings_flags(parser)
+
+
+def _run(options: argparse.Namespace) -> int:
+    import zenoh
+
+    from potserver.adapters.log import configure_logging, get_logger
+
+    settings = settings_of(options)
+    configure_logging(settings.log.level, settings.log.format)
+    zenoh.try_init_log_from_env()  # RUST_LOG
+    from potserver.server import MapServer  # after the flags are known to be good
+
+    with StopSignals.installed() as stop:
+        server = MapServer(settings)
+        try:
+            server.start()
+            stop.wait()
+            get_logger("potserver.cli").info("stop_requested", signal=stop.name)
+        finally:
+            clean = server.stop()
+    if clean:
+        return EXIT_OK
+    # a thread or Zenoh did not end in time: leaving the ordinary way might wait for it for ever
+    sys.stderr.flush()
+    os._exit(EXIT_UNCLEAN)
+
+
+class StopSignals:
+    """SIGTERM and SIGINT: the first sets a flag, the second ends the process where it stands."""
+
+    def __init__(self) -> None:
+        self.name: str | None = None
+        # a pipe and not an Event: a handler may interrupt the very thread that holds the Event's lock
+        self._read_end, self._write_end = os.pipe()
+
+    @classmethod
+    @contextlib.contextmanager
+    def installed(cls) -> Iterator[StopSignals]:
+        """Handle the signals inside the block."""
+        stop = cls()
+        before = {number: signal.signal(number, stop._note) for number in (signal.SIGTERM, signal.SIGINT)}
+        try:
+            yield stop
+        finally:
+            for number, handler in before.items():
+                signal.signal(number, handler)
+            os.close(stop._read_end)
+            os.close(stop._write_end)
+
+    def wait(self) -> None:
+        """Return once a signal has come."""
+        while self.name is None:
+            select.select([self._read_end], [], [])
+
+    def _note(self, number: int, _frame: FrameType | None) -> None:
+        if self.name is not None:
+            os.write(2, b"potserver: second signal, leaving at once\n")
+            os._exit(EXIT_FORCED)
+        self.name = signal.Signals(number).name
+        os.write(self._write_end, b".")
