@@ -28,7 +28,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from potclient import MapClient, PotclientError
-from potserver.adapters import codec
+from potserver.codec.clouds import read_cloud
 from potserver.domain.map_state import MapState
 from potserver.domain.types import KernelSet, Scan, yaw_pose
 from potserver.mapping.service import MappingService
@@ -295,7 +295,7 @@ def _follow(server: Server, store: Path, order: list[ScanId], report: Report) ->
         return
     journal = Journal(store / "default" / JOURNAL)
     try:
-        kept = [(number, codec.read_cloud(payload)) for number, payload in journal.scans(journal.pruned)]
+        kept = [(number, read_cloud(payload)) for number, payload in journal.scans(journal.pruned)]
         assert len(order) <= journal.last <= len(order) + 1, (
             f"{len(order)} logged, {journal.last} in the journal"
         )

@@ -22,9 +22,9 @@ from potclient import cli as client_cli
 from potclient.datasets import FORMATS, FRAMES
 from potschemas import __version__
 from potserver import bundled
-from potserver.adapters.log import configure_logging, get_logger
 from potserver.config import Settings, as_tree, load_settings, to_toml
 from potserver.errors import PotserverError, SettingsError
+from potserver.log import configure_logging, get_logger
 
 if TYPE_CHECKING:
     from potserver.domain.dictionary import AtomDictionary
@@ -266,7 +266,8 @@ def _draw_atoms(dictionary: AtomDictionary, options: argparse.Namespace, *, titl
 
 
 def _atoms_export(options: argparse.Namespace) -> int:
-    from potserver.adapters import codec
+    from potschemas import wire
+    from potserver.codec.atoms import encode_atom
     from potserver.domain.dictionary import AtomDictionary
     from potserver.domain.types import AnswerRule
 
@@ -279,7 +280,7 @@ def _atoms_export(options: argparse.Namespace) -> int:
     try:
         folder.mkdir(parents=True, exist_ok=True)
         for atom in atoms:
-            (folder / f"{atom.atom_id}.atom").write_bytes(codec.encode_atom(atom, {}, rule).payload)
+            (folder / f"{atom.atom_id}.atom").write_bytes(wire.encode(encode_atom(atom, {}, rule)))
     except OSError as error:
         raise SettingsError(f"cannot write to {folder}: {error.strerror or error}") from error
     _say(f"{len(atoms)} atoms written to {folder}")
@@ -287,8 +288,8 @@ def _atoms_export(options: argparse.Namespace) -> int:
 
 
 def _atoms_import(options: argparse.Namespace) -> int:
-    from potserver.adapters import codec
     from potserver.atoms.admission import admit
+    from potserver.codec.atoms import read_atom_file
     from potserver.domain.dictionary import AtomDictionary
 
     settings = _settings(options)
@@ -296,7 +297,7 @@ def _atoms_import(options: argparse.Namespace) -> int:
     dictionary = AtomDictionary.load(out) if out.exists() else AtomDictionary()
     for name in options.file:
         try:
-            atom = codec.read_atom_file(Path(name).read_bytes())
+            atom = read_atom_file(Path(name).read_bytes())
             admit(atom, dictionary, settings.atoms.admission)
         except OSError as error:
             raise SettingsError(f"cannot read {name}: {error.strerror or error}") from error

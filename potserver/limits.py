@@ -3,24 +3,27 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import ClassVar
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class Limits:
-    """Every bound on what comes in; each is a setting in the `[limits]` table."""
+    """Every bound on what comes in. The fields are settings, in the table `[limits]`; the others are constants."""
 
     max_cloud_bytes: int = 8 * 2**20
     max_cloud_points: int = 400_000
     max_query_bytes: int = 4 * 2**20
     max_query_points: int = 200_000
     max_grid_cells: int = 4_000_000
-    max_query_rays: int = 50_000
-    max_query_poses: int = 5_000
-    max_query_spheres: int = 256
     max_query_samples: int = 4_000_000  # steps of all rays of a query; cells at all poses of one
-    max_query_tiles: int = 100_000  # that the asker of one `q/tiles` has
     max_coordinate_m: float = 2.0e7  # each coordinate in the map frame; UTM northings end at 1e7
     max_robots: int = 1024  # robots remembered at once: stamps, poses, presence
+
+    # The bytes and the samples of a query bound its work; these only say early that a query asks for too much.
+    max_query_rays: ClassVar[int] = 50_000
+    max_query_poses: ClassVar[int] = 5_000
+    max_query_spheres: ClassVar[int] = 256
+    max_query_tiles: ClassVar[int] = 100_000  # that the asker of one `q/tiles` has
 
     @property
     def wire_guard_bytes(self) -> int:

@@ -28,9 +28,9 @@ from potclient.results import Receipt
 from potschemas import __version__
 from potschemas.messages import SectorReport
 from potserver import bundled
-from potserver.adapters.log import configure_logging
 from potserver.config import Settings
 from potserver.errors import PotserverError
+from potserver.log import configure_logging
 from potserver.mapping.settings import PROFILES, MappingSettings
 from potserver.numerics.threads import default_threads
 from potserver.server import MapServer

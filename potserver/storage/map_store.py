@@ -15,10 +15,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
 
-from potserver.adapters import codec
-from potserver.adapters.log import get_logger
-from potserver.adapters.ports import Mapper
-from potserver.adapters.threads import spawn
+from potserver.codec.clouds import encode_cloud, read_cloud
 from potserver.domain.map_state import MapState
 from potserver.domain.types import Scan
 from potserver.errors import (
@@ -30,8 +27,11 @@ from potserver.errors import (
     UnsupportedError,
 )
 from potserver.health import Health
+from potserver.log import get_logger
+from potserver.mapping.service import MappingService
 from potserver.storage.journal import Journal
 from potserver.storage.map_file import MapFile, Origin, SavedMap, read_map, write_map
+from potserver.threads import spawn
 
 log = get_logger("potserver.store")
 
@@ -119,7 +119,7 @@ class MapStore:
 
     # --- start ----------------------------------------------------------------------------------------------
 
-    def restore(self, mapper: Mapper) -> Restored:
+    def restore(self, mapper: MappingService) -> Restored:
         """Give an empty mapper the map that is kept: the last snapshot, and the scans of the journal after it.
 
         Raises:
@@ -173,7 +173,7 @@ class MapStore:
                 reason="damaged",
             )
 
-    def _replay(self, mapper: Mapper, stamps: dict[str, int]) -> int:
+    def _replay(self, mapper: MappingService, stamps: dict[str, int]) -> int:
         n = self._journal.last - self._taken
         if n > 0:
             log.info("journal_replaying", map_id=self._map_id, n_scans=n)
@@ -181,7 +181,7 @@ class MapStore:
         done = 0
         for number, payload in self._journal.scans(self._taken):
             try:
-                scan = codec.read_cloud(payload)
+                scan = read_cloud(payload)
                 mapper.integrate(scan)
             except PotserverError as error:
                 raise MapFileError(
@@ -206,7 +206,7 @@ class MapStore:
             StorageError: the disk refuses; the scan must not enter the map.
         """
         started_s = time.perf_counter()
-        payload = codec.encode_cloud(scan)
+        payload = encode_cloud(scan)
         try:
             self._journal.append(payload, prune_to=self._taken)
         except StorageError:
@@ -217,7 +217,7 @@ class MapStore:
         self._health.count("store.appends")
         self._health.observe("journal", (time.perf_counter() - started_s) * 1e3)
 
-    def advance(self, mapper: Mapper, stamps: Mapping[str, int]) -> None:
+    def advance(self, mapper: MappingService, stamps: Mapping[str, int]) -> None:
         """The last scan is in the map; a snapshot is begun if enough have come. Never waits.
 
         Args:
@@ -247,7 +247,7 @@ class MapStore:
                 self._newest = newest
                 self._asked, self._unsaved_bytes = self._number, 0
 
-    def save(self, name: str | None, mapper: Mapper, stamps: Mapping[str, int]) -> str:
+    def save(self, name: str | None, mapper: MappingService, stamps: Mapping[str, int]) -> str:
         """Write a snapshot now, and a file of its own if there is a name; what was done, for people.
 
         Raises:
@@ -267,7 +267,7 @@ class MapStore:
         self._health.count("store.saved")
         return f"{state.n_scans} scans saved as {path}, {n_bytes} bytes"
 
-    def load(self, name: str, mapper: Mapper) -> tuple[MapState, dict[str, int]]:
+    def load(self, name: str, mapper: MappingService) -> tuple[MapState, dict[str, int]]:
         """Read a saved map: the state to replace the present one with, of a new epoch and a higher revision, and its stamps.
 
         Raises:
@@ -350,7 +350,7 @@ class MapStore:
             elapsed_ms=round(elapsed_ms, 1),
         )
 
-    def _check_fits(self, mapper: Mapper, saved: SavedMap, path: Path) -> None:
+    def _check_fits(self, mapper: MappingService, saved: SavedMap, path: Path) -> None:
         r, size_m = saved.record, mapper.settings.tile_size_m
         if r.grid is not None and r.grid[0] != size_m:
             raise MapFileError(
@@ -374,13 +374,13 @@ class MemoryOnly:
     def append(self, scan: Scan) -> None:
         """Nothing to do."""
 
-    def advance(self, mapper: Mapper, stamps: Mapping[str, int]) -> None:
+    def advance(self, mapper: MappingService, stamps: Mapping[str, int]) -> None:
         """Nothing to do."""
 
     def replace(self, state: MapState, stamps: Mapping[str, int]) -> None:
         """Nothing to do."""
 
-    def save(self, name: str | None, mapper: Mapper, stamps: Mapping[str, int]) -> str:
+    def save(self, name: str | None, mapper: MappingService, stamps: Mapping[str, int]) -> str:
         """Not here.
 
         Raises:
@@ -388,7 +388,7 @@ class MemoryOnly:
         """
         raise UnsupportedError(_IN_MEMORY)
 
-    def load(self, name: str, mapper: Mapper) -> tuple[MapState, dict[str, int]]:
+    def load(self, name: str, mapper: MappingService) -> tuple[MapState, dict[str, int]]:
         """Not here.
 
         Raises:

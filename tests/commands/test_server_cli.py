@@ -18,9 +18,9 @@ import pytest
 
 from potclient.atoms import Atom
 from potserver import cli
-from potserver.adapters.log import configure_logging, get_logger
 from potserver.config import Settings, load_settings
 from potserver.domain.dictionary import AtomDictionary
+from potserver.log import configure_logging, get_logger
 
 
 @pytest.fixture(autouse=True)
