@@ -25,7 +25,7 @@ import numpy as np
 
 from benchmarks.server_process import START_S, ServerProcess
 from potclient import MapClient, PotclientError
-from potserver.adapters import codec
+from potserver.codec.clouds import read_cloud
 from potserver.domain.map_state import MapState
 from potserver.domain.types import KernelSet, Scan, yaw_pose
 from potserver.mapping.service import MappingService
@@ -252,7 +252,7 @@ def _follow(server: ServerProcess, store: Path, order: list[ScanId], report: Rep
         return
     journal = Journal(store / "default" / JOURNAL)
     try:
-        kept = [(number, codec.read_cloud(payload)) for number, payload in journal.scans(journal.pruned)]
+        kept = [(number, read_cloud(payload)) for number, payload in journal.scans(journal.pruned)]
         assert len(order) <= journal.last <= len(order) + 1, (
             f"{len(order)} logged, {journal.last} in the journal"
         )

@@ -21,7 +21,7 @@ class Limits:
     max_coordinate_m: Annotated[float, "of anything in the map frame; UTM northings end at 1e7"] = 2.0e7
     max_robots: Annotated[int, "robots remembered at once: stamps, poses, presence"] = 1024
 
-    # `max_query_bytes` and `max_query_samples` bound the work; these only keep single numbers sane
+    # The bytes and the samples of a query bound its work; these only say early that a query asks for too much.
     max_query_rays: ClassVar[int] = 50_000
     max_query_poses: ClassVar[int] = 5_000
     max_query_spheres: ClassVar[int] = 256

@@ -9,8 +9,7 @@ import numpy as np
 from potclient.mirror import Ask
 from potschemas import messages, wire
 from potschemas.answers import AnswerRule
-from potserver.adapters import codec
-from potserver.asking.tiles import plan_tiles
+from potserver.adapters.questions.tiles import decode_tiles, encode_part
 from potserver.domain.kernel_map import KernelMap
 from potserver.domain.map_state import MapState
 from potserver.domain.tiles import COARSE, MapKernels, Tile, TiledMap, TileGrid, TileIndex
@@ -73,18 +72,10 @@ def parts_about(
     state: MapState, query: messages.TilesQuery, part_kernels: int = 20_000
 ) -> list[messages.TilesPart]:
     """What a server that holds this map answers."""
-    request = codec.decode_tiles_query(wire.encode(query), Limits())
-    plan = plan_tiles(
-        state,
-        request.known,
-        None if request.lower is None else np.array(request.lower),
-        None if request.upper is None else np.array(request.upper),
-        tile_size_m=GRID.size_m,
-        mantissa_bits=request.mantissa_bits,
-        part_kernels=part_kernels,
-    )
-    payloads = [codec.encode_tiles_part(plan, part).payload for part in range(plan.n_parts)]
-    return [wire.decode(payload, messages.TilesPart) for payload in payloads]
+    asked = decode_tiles(wire.decode(wire.encode(query), messages.TilesQuery))
+    plan = asked.plan(state, Limits(), tile_size_m=GRID.size_m, part_kernels=part_kernels)
+    parts = [encode_part(plan, number, run) for number, run in enumerate(plan.parts())]
+    return [wire.decode(wire.encode(part), messages.TilesPart) for part in parts]
 
 
 def asking(

@@ -11,10 +11,10 @@ from typing import NamedTuple
 
 import zenoh
 
-from potserver.adapters.ports import Payload
 from potserver.errors import OverloadedError, PotserverError, ShuttingDownError
 
 INTEGRATE_LANE = ""  # all `q/integrate` clouds: whose they are is only known once they are decoded
+RETRY_AFTER_S = 0.5  # what a refused sender is advised to wait: about as long as a scan takes to map
 _MAX_BARRIERS = 16
 
 
@@ -23,7 +23,7 @@ class CloudJob:
     """One cloud, not decoded yet."""
 
     robot_id: str | None  # from the key; None: `q/integrate`, the message says it
-    payload: Payload
+    payload: zenoh.ZBytes
     query: zenoh.Query | None = None  # `q/integrate` only: the receipt is its reply
     arrived_s: float = dataclasses.field(default_factory=time.monotonic)
     n_bytes: int = dataclasses.field(init=False)
@@ -69,8 +69,8 @@ class IntakeQueue:
     """Many producers that never wait, one consumer: the map's writer.
 
     When it is full, the newest clouds of the robot that holds most of what is short, places or bytes, make room
-    for a robot that will still hold no more than it; otherwise, or if even that is not enough, the newcomer is
-    refused and nobody loses a place. Either way somebody is told at once.
+    for a robot that will then hold at most as much. If that is not possible or not enough, the newcomer is refused
+    and nobody loses a place. Either way somebody is told at once.
 
     Args:
         max_queued: Clouds.
@@ -78,7 +78,9 @@ class IntakeQueue:
         retry_after_s: What a refused sender is advised to wait.
     """
 
-    def __init__(self, *, max_queued: int, max_queued_bytes: int, retry_after_s: float = 0.5) -> None:
+    def __init__(
+        self, *, max_queued: int, max_queued_bytes: int, retry_after_s: float = RETRY_AFTER_S
+    ) -> None:
         self._max_queued, self._max_bytes, self._retry_after_s = max_queued, max_queued_bytes, retry_after_s
         self._changed = threading.Condition()
         self._epochs: collections.deque[_Epoch] = collections.deque([_Epoch()])
@@ -99,6 +101,12 @@ class IntakeQueue:
         """Bytes waiting."""
         with self._changed:
             return self._n_bytes
+
+    @property
+    def n_barriers(self) -> int:
+        """Barriers waiting."""
+        with self._changed:
+            return len(self._epochs) - 1
 
     @property
     def is_admitting(self) -> bool:

@@ -8,8 +8,8 @@ import threading
 import time
 from collections.abc import Callable
 
-from potserver.adapters.log import get_logger
-from potserver.adapters.threads import spawn
+from potserver.log import get_logger
+from potserver.threads import spawn
 
 log = get_logger("potserver.outbox")
 
@@ -53,6 +53,12 @@ class Outbox:
         """Tasks waiting."""
         with self._changed:
             return len(self._tasks)
+
+    @property
+    def n_bytes(self) -> int:
+        """What the tasks waiting and the one in work declared."""
+        with self._changed:
+            return self._n_bytes
 
     def post(self, task: Task, n_bytes: int = 0, *, ended: Ended | None = None) -> None:
         """Queue what must be sent; waits while the queue is full, which slows down whoever causes it."""

@@ -1,4 +1,4 @@
-"""Poses of the robots' pose streams, and the pose at a cloud's stamp."""
+"""Poses of the robots' pose streams, published on `in/<robot>/pose`, and the pose at a cloud's stamp."""
 
 from __future__ import annotations
 
@@ -8,34 +8,97 @@ import threading
 import time
 
 import numpy as np
+import zenoh
 from numpy.typing import NDArray
 
+from potschemas import keys, messages
+from potserver.adapters.key_exprs import check_robot_id, sender_of
 from potserver.adapters.stamps import check_not_future
+from potserver.codec.base import MAX_SMALL_BYTES, check_encoding, check_size
+from potserver.codec.clouds import decode_pose
 from potserver.domain.types import Float64, check_rigid
-from potserver.errors import NoPoseError
+from potserver.errors import NoPoseError, PotserverError
+from potserver.health import Health
+from potserver.log import get_logger
+
+log = get_logger("potserver.poses")
+
+POSES_PER_ROBOT = 1024  # kept: 20 s at 50 Hz
+WAIT_S = (
+    0.2  # for the stream to reach a cloud's stamp: a few of its periods. The writer stands still that long
+)
+_CHANNEL = 256  # a burst beyond this loses its oldest poses; interpolation bridges the hole
+
+
+class PoseSubscriber:
+    """Fills the pose buffer of one map."""
+
+    def __init__(
+        self,
+        session: zenoh.Session,
+        map_keys: keys.MapKeys,
+        *,
+        poses: PoseBuffer,
+        health: Health,
+        allowed_robots: frozenset[str],
+    ) -> None:
+        self._poses, self._health, self._allowed_robots = poses, health, allowed_robots
+        self._subscriber = session.declare_subscriber(
+            map_keys.pose("*"), zenoh.handlers.RingChannel(_CHANNEL)
+        )
+
+    def run(self) -> None:
+        """Take samples until undeclared, on a thread of our own."""
+        for sample in self._subscriber:
+            robot_id = sender_of(sample.key_expr)
+            if robot_id is None:
+                self._health.count("poses.rejected.bad_key")
+                continue
+            try:
+                self._add(robot_id, sample)
+                self._health.count("poses.accepted")
+            except PotserverError as error:
+                self._health.count(f"poses.rejected.{error.code}")
+                log.debug("pose_refused", key=str(sample.key_expr), reason=error.code, detail=str(error))
+            except Exception:
+                log.exception("pose_failed", key=str(sample.key_expr))
+                self._health.count("poses.rejected.internal")
+
+    def undeclare(self) -> None:
+        """Take no more; ends `run`."""
+        self._subscriber.undeclare()
+
+    def _add(self, robot_id: str, sample: zenoh.Sample) -> None:
+        self._health.count("poses.received")
+        check_robot_id(robot_id, self._allowed_robots)
+        check_encoding(str(sample.encoding), messages.Pose)
+        check_size(len(sample.payload), MAX_SMALL_BYTES, "pose")
+        self._poses.add(robot_id, *decode_pose(sample.payload.to_bytes()))
 
 
 class PoseBuffer:
     """The last poses of every robot, bounded in robots and in poses a robot.
 
     Args:
-        max_per_robot: Poses kept; 1024 are 20 s at 50 Hz.
-        max_robots: Robots kept; the one that has been silent longest goes first.
         max_gap_s: Two poses further apart than this are not interpolated between.
         max_future_s: Poses further ahead of our clock are refused.
+        max_robots: Robots kept; the one that has been silent longest goes first.
+        max_per_robot: Poses kept of each.
+        wait_s: How long `at` waits for the stream to reach a stamp.
     """
 
     def __init__(
         self,
         *,
-        max_per_robot: int = 1024,
-        max_robots: int = 1024,
         max_gap_s: float = 0.5,
         max_future_s: float = 5.0,
+        max_robots: int = 1024,
+        max_per_robot: int = POSES_PER_ROBOT,
+        wait_s: float = 0.0,
     ) -> None:
         self._max_per_robot, self._max_robots = max_per_robot, max_robots
         self._max_gap_ns = int(max_gap_s * 1e9)
-        self._max_future_s = max_future_s
+        self._max_future_s, self._wait_s = max_future_s, wait_s
         self._changed = threading.Condition()
         self._tracks: collections.OrderedDict[str, _Track] = collections.OrderedDict()
 
@@ -56,18 +119,15 @@ class PoseBuffer:
             track.insert(stamp_ns, T_map_sensor, self._max_per_robot)
             self._changed.notify_all()
 
-    def at(self, robot_id: str, stamp_ns: int, *, wait_s: float = 0.0) -> Float64:
-        """(4, 4) pose at a stamp, interpolated between its two neighbours.
+    def at(self, robot_id: str, stamp_ns: int) -> Float64:
+        """(4, 4) pose of a robot at a stamp, interpolated between its two neighbours.
 
-        Args:
-            robot_id: Whose stream.
-            stamp_ns: When.
-            wait_s: How long to wait for the stream to reach the stamp; a robot without a stream is not waited
-                for.
+        Waits `wait_s` for the stream to reach the stamp; a robot without a stream is not waited for.
+
         Raises:
             NoPoseError: no stream, the stamp is outside the buffer, or its neighbours are too far apart.
         """
-        deadline = time.monotonic() + wait_s
+        deadline = time.monotonic() + self._wait_s
         with self._changed:
             while True:
                 track = self._tracks.get(robot_id)

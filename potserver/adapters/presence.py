@@ -8,8 +8,8 @@ import zenoh
 
 from potschemas import keys
 from potserver.adapters.key_exprs import sender_of
-from potserver.adapters.log import get_logger
 from potserver.health import Health
+from potserver.log import get_logger
 
 log = get_logger("potserver.presence")
 

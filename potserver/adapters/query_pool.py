@@ -8,11 +8,13 @@ import threading
 import time
 from collections.abc import Callable
 
-from potserver.adapters.log import get_logger
-from potserver.adapters.threads import spawn
 from potserver.errors import OverloadedError, PotserverError, ShuttingDownError
+from potserver.log import get_logger
+from potserver.threads import spawn
 
 log = get_logger("potserver.queries")
+
+RETRY_AFTER_S = 0.2  # what a refused asker is advised to wait: about as long as one part of a grid takes
 
 
 @dataclasses.dataclass(slots=True, eq=False, kw_only=True)
@@ -36,7 +38,9 @@ class QueryPool:
         retry_after_s: What a refused asker is advised to wait.
     """
 
-    def __init__(self, *, threads: int, max_queued: int, max_queued_bytes: int, retry_after_s: float) -> None:
+    def __init__(
+        self, *, threads: int, max_queued: int, max_queued_bytes: int, retry_after_s: float = RETRY_AFTER_S
+    ) -> None:
         self._max_queued, self._max_bytes, self._retry_after_s = max_queued, max_queued_bytes, retry_after_s
         self._changed = threading.Condition()
         self._jobs: collections.deque[QueryJob] = collections.deque()

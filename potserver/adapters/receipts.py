@@ -1,9 +1,8 @@
 """What goes back for a cloud: exactly one receipt, the transported parameters, and the tick of the revision.
 
-Lanes: receipts and revisions DATA_HIGH, parameters DATA, all BLOCK, because Zenoh drops without telling
-    anyone. Blocking is
-done by two outboxes of the map, so that neither the mapper nor a receipt ever waits for somebody's slow bulk
-transfer; when the bulk outbox is full, parameters are dropped and counted (`params.dropped`).
+Lanes: receipts and revisions DATA_HIGH, parameters DATA; all BLOCK, because Zenoh drops without telling anyone. Two
+outboxes of the map do the blocking, so that neither the mapper nor a receipt ever waits for somebody's slow bulk
+transfer. When the bulk outbox is full, parameters are dropped and counted (`params.dropped`).
 """
 
 from __future__ import annotations
@@ -12,23 +11,35 @@ import contextlib
 import math
 import time
 from collections.abc import Callable
+from typing import NamedTuple
 
 import zenoh
 
+from potschemas import messages
 from potschemas.keys import MapKeys
-from potserver.adapters import codec
 from potserver.adapters.intake import CloudJob, IntakeQueue
-from potserver.adapters.log import get_logger
 from potserver.adapters.outbox import End, Outbox
-from potserver.adapters.ports import Mapper
-from potserver.domain.types import MapUpdate, Scan, TileChange
+from potserver.codec.base import Wire, encode, encode_error
+from potserver.codec.clouds import UNKNOWN_SEQ, decode_cloud_head
+from potserver.codec.kernels import encode_kernels
+from potserver.domain.map_state import MapState
+from potserver.domain.types import MapUpdate, Scan, SectorMatch, TileChange
 from potserver.errors import PotserverError, TooLargeError
 from potserver.health import Health
 from potserver.limits import Limits
+from potserver.log import get_logger
+from potserver.mapping.service import MappingService
 
 log = get_logger("potserver.receipts")
 
-_MAX_TILES = 10_000  # in one tick
+_MAX_TILES = 10_000  # in one tick: more than a receiver decodes at once
+
+
+class Waited(NamedTuple):
+    """What a cloud met on its way to the mapper."""
+
+    queue_depth: int  # clouds behind it when its receipt was made
+    wait_ms: float  # in the queue
 
 
 class ReceiptSender:
@@ -39,7 +50,7 @@ class ReceiptSender:
         session: zenoh.Session,
         keys: MapKeys,
         *,
-        mapper: Mapper,
+        mapper: MappingService,
         intake: IntakeQueue,
         health: Health,
         limits: Limits,
@@ -57,36 +68,30 @@ class ReceiptSender:
     ) -> None:
         """The cloud is in the map."""
         self._health.count("clouds.accepted")
-        map_id = self._keys.map_id
-        snapshot = self._mapper.snapshot
-        rule = snapshot.rule
-        depth = self._intake.depth
-
-        def receipt(with_kernels: bool) -> codec.Wire:
-            return codec.accepted_receipt(
-                map_id=map_id,
-                scan=scan,
-                update=update,
-                kernels=codec.encode_kernels(update.kernels, rule) if with_kernels else None,
-                queue_depth=depth,
-                wait_ms=wait_ms,
-                integrate_ms=integrate_ms,
-            )
+        map_id, waited = self._keys.map_id, Waited(self._intake.depth, wait_ms)
 
         def publish_params() -> None:
-            wire = codec.encode_params(map_id=map_id, scan=scan, update=update, rule=rule)
-            self._put(self._keys.params(scan.robot_id), wire, zenoh.Priority.DATA)
+            self._put(
+                self._keys.params(scan.robot_id),
+                encode_params(map_id, scan, update),
+                zenoh.Priority.DATA,
+            )
             self._health.count("params.sent")
 
         if job.query is not None:
             query = job.query
             self._bulk.post_now(
-                lambda: self._reply(query, receipt(with_kernels=True)), ended=self._count_receipt
+                lambda: self._reply(
+                    query, encode_accepted(map_id, scan, update, waited, integrate_ms, with_kernels=True)
+                ),
+                ended=self._count_receipt,
             )
         else:
             self._prompt.post_now(
                 lambda: self._put(
-                    self._keys.receipt(scan.robot_id), receipt(with_kernels=False), zenoh.Priority.DATA_HIGH
+                    self._keys.receipt(scan.robot_id),
+                    encode_accepted(map_id, scan, update, waited, integrate_ms, with_kernels=False),
+                    zenoh.Priority.DATA_HIGH,
                 ),
                 ended=self._count_receipt,
             )
@@ -97,17 +102,13 @@ class ReceiptSender:
     def tick(self, map_revision: int, map_kernels: int, changed: TileChange) -> None:
         """The map changed: say so to all."""
         stamp_ns = time.time_ns()
-        # more tiles than a receiver decodes at once, only ever after a clear, come in several ticks of one revision
+        # many tiles come in several ticks of one revision
         for start in range(0, max(1, len(changed.tiles)), _MAX_TILES):
             some = changed._replace(tiles=changed.tiles[start : start + _MAX_TILES])
 
             def send(some: TileChange = some) -> None:
-                wire = codec.encode_revision(
-                    map_id=self._keys.map_id,
-                    map_revision=map_revision,
-                    map_kernels=map_kernels,
-                    changed=some,
-                    stamp_ns=stamp_ns,
+                wire = encode_revision(
+                    self._keys.map_id, map_revision, map_kernels, changed=some, stamp_ns=stamp_ns
                 )
                 self._put(self._keys.revision, wire, zenoh.Priority.DATA_HIGH)
 
@@ -122,8 +123,8 @@ class ReceiptSender:
             patient: Wait while the outbox is full: for the thread of the published clouds, so that a flood of
                 refused ones is slowed down at its source. Queries never wait: other questions are behind them.
         """
-        self._health.count(f"clouds.{codec.refusal(error).value}.{error.code}")
-        depth, wait_ms = self._intake.depth, job.wait_ms()
+        self._health.count(f"clouds.{refusal(error).value}.{error.code}")
+        waited, state = Waited(self._intake.depth, job.wait_ms()), self._mapper.state
         if job.query is not None:
             self._health.count(f"queries.integrate.{error.code}")
             self._refuse_query(job.query, error)
@@ -133,7 +134,7 @@ class ReceiptSender:
         n_bytes = 0 if payload is None else job.n_bytes
 
         def send() -> None:
-            seq = codec.UNKNOWN_SEQ if payload is None else codec.decode_cloud_head(payload.to_bytes()).seq
+            seq = UNKNOWN_SEQ if payload is None else decode_cloud_head(payload.to_bytes()).seq
             self._report(error)(
                 "scan_refused",
                 map_id=self._keys.map_id,
@@ -142,17 +143,7 @@ class ReceiptSender:
                 reason=error.code,
                 detail=str(error),
             )
-            snapshot = self._mapper.snapshot
-            wire = codec.refused_receipt(
-                map_id=self._keys.map_id,
-                robot_id=robot_id,
-                seq=seq,
-                error=error,
-                queue_depth=depth,
-                wait_ms=wait_ms,
-                map_revision=snapshot.map_revision,
-                map_kernels=len(snapshot),
-            )
+            wire = encode_refused(self._keys.map_id, robot_id, seq, error, waited, state)
             self._put(self._keys.receipt(robot_id), wire, zenoh.Priority.DATA_HIGH)
 
         if patient:
@@ -165,7 +156,7 @@ class ReceiptSender:
 
         def send() -> None:
             with query, contextlib.suppress(zenoh.ZError):  # the asker may be gone
-                wire = codec.encode_error(error)
+                wire = encode_error(error)
                 query.reply_err(wire.payload, encoding=wire.encoding)
 
         self._prompt.post_now(send, ended=self._count_receipt)
@@ -181,7 +172,7 @@ class ReceiptSender:
         self._reported_s[error.code] = now_s
         return log.info
 
-    def _put(self, key: str, wire: codec.Wire, priority: zenoh.Priority) -> None:
+    def _put(self, key: str, wire: Wire, priority: zenoh.Priority) -> None:
         self._session.put(
             key,
             wire.payload,
@@ -190,7 +181,111 @@ class ReceiptSender:
             congestion_control=zenoh.CongestionControl.BLOCK,
         )
 
-    def _reply(self, query: zenoh.Query, wire: codec.Wire) -> None:
+    def _reply(self, query: zenoh.Query, wire: Wire) -> None:
         with query:
             query.reply(self._keys.query("integrate"), wire.payload, encoding=wire.encoding)
             self._health.count("queries.integrate.ok")
+
+
+# --- messages -----------------------------------------------------------------------------------------------
+
+
+def refusal(error: PotserverError) -> messages.ReceiptStatus:
+    """`dropped` for load and shutdown, `rejected` for everything that would fail again."""
+    return messages.ReceiptStatus.DROPPED if error.retryable else messages.ReceiptStatus.REJECTED
+
+
+def encode_accepted(
+    map_id: str, scan: Scan, update: MapUpdate, waited: Waited, integrate_ms: float, *, with_kernels: bool
+) -> Wire:
+    """The receipt of a cloud that is in the map; with its kernels for `q/integrate`."""
+    return encode(
+        messages.Receipt(
+            map=map_id,
+            robot=scan.robot_id,
+            seq=scan.seq,
+            status=messages.ReceiptStatus.ACCEPTED,
+            queue_depth=waited.queue_depth,
+            wait_ms=waited.wait_ms,
+            integrate_ms=integrate_ms,
+            map_revision=int(update.map_revision),
+            n_points=int(update.n_points),
+            n_kernels=len(update.kernels),
+            n_kernels_added=int(update.n_kernels_added),
+            n_kernels_transported=int(update.n_kernels_transported),
+            map_kernels=int(update.map_kernels),
+            sectors=_sectors(update.sectors),
+            kernels=encode_kernels(update.kernels, update.rule) if with_kernels else None,
+        )
+    )
+
+
+def encode_refused(
+    map_id: str, robot_id: str, seq: int, error: PotserverError, waited: Waited, state: MapState
+) -> Wire:
+    """The receipt of a cloud that is not in the map; `state` is the map's at that moment."""
+    return encode(
+        messages.Receipt(
+            map=map_id,
+            robot=robot_id,
+            seq=seq,
+            status=refusal(error),
+            reason=error.code,
+            message=str(error),
+            queue_depth=waited.queue_depth,
+            wait_ms=waited.wait_ms,
+            map_revision=state.map_revision,
+            map_kernels=len(state.snapshot),
+        )
+    )
+
+
+def encode_params(map_id: str, scan: Scan, update: MapUpdate) -> Wire:
+    """The transported parameters of one cloud."""
+    return encode(
+        messages.Params(
+            map=map_id,
+            robot=scan.robot_id,
+            seq=scan.seq,
+            stamp_ns=scan.stamp_ns,
+            map_revision=int(update.map_revision),
+            kernels=encode_kernels(update.kernels, update.rule),
+            sectors=_sectors(update.sectors),
+        )
+    )
+
+
+def encode_revision(
+    map_id: str, map_revision: int, map_kernels: int, *, changed: TileChange, stamp_ns: int
+) -> Wire:
+    """The tick of `ev/revision`."""
+    return encode(
+        messages.Revision(
+            map=map_id,
+            map_revision=int(map_revision),
+            stamp_ns=stamp_ns,
+            n_kernels=int(map_kernels),
+            tile_size_m=float(changed.tile_size_m),
+            changed_tiles=[[int(i) for i in tile] for tile in changed.tiles],
+        )
+    )
+
+
+def _sectors(matches: list[SectorMatch]) -> list[messages.SectorReport]:
+    return [
+        messages.SectorReport(
+            azimuth_min_rad=float(m.azimuth_min_rad),
+            azimuth_max_rad=float(m.azimuth_max_rad),
+            n_hits=int(m.n_hits),
+            n_free=int(m.n_free),
+            atom_id=m.atom_id,
+            rotation_rad=float(m.rotation_rad),
+            w2_m2=float(m.w2_m2),
+            n_kernels=int(m.n_kernels),
+            converged=bool(m.converged),
+            marginal_error=float(m.marginal_error),
+            n_iterations=int(m.n_iterations),
+            reason=m.reason,
+        )
+        for m in matches
+    ]

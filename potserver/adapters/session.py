@@ -18,8 +18,8 @@ from typing import Annotated, Any
 
 import zenoh
 
-from potserver.adapters.log import get_logger
 from potserver.errors import SettingsError
+from potserver.log import get_logger
 
 log = get_logger("potserver.session")
 

@@ -2,24 +2,23 @@
 
 from __future__ import annotations
 
-import collections
 import time
-from collections.abc import Mapping
 
-from potserver.adapters import codec
+from potserver.adapters.clouds import CloudReader
 from potserver.adapters.intake import CloudJob, IntakeQueue
-from potserver.adapters.log import get_logger
-from potserver.adapters.ports import Keeper, Mapper
-from potserver.adapters.poses import PoseBuffer
 from potserver.adapters.receipts import ReceiptSender
-from potserver.adapters.stamps import check_not_future
+from potserver.adapters.stamps import StampOrder
 from potserver.domain.map_state import MapState
-from potserver.domain.types import Float64, Scan, TileChange
-from potserver.errors import OldStampError, PotserverError
+from potserver.domain.types import Float64, TileChange
+from potserver.errors import PotserverError
 from potserver.health import Health
-from potserver.limits import Limits
+from potserver.log import get_logger
+from potserver.mapping.service import MappingService
+from potserver.storage.map_store import MapStore, MemoryOnly
 
 log = get_logger("potserver.writer")
+
+Keeper = MapStore | MemoryOnly
 
 
 class MapWriter:
@@ -27,28 +26,17 @@ class MapWriter:
 
     def __init__(
         self,
-        map_id: str,
-        *,
-        mapper: Mapper,
+        mapper: MappingService,
         keeper: Keeper,
-        last_stamps: Mapping[str, int],
+        *,
+        stamps: StampOrder,
         intake: IntakeQueue,
+        reader: CloudReader,
         receipts: ReceiptSender,
-        poses: PoseBuffer,
         health: Health,
-        limits: Limits,
-        allowed_robots: frozenset[str],
-        allow_old_stamps: bool,
-        max_future_s: float,
-        pose_wait_s: float,
     ) -> None:
-        self._map_id = map_id
-        self._mapper, self._keeper = mapper, keeper
-        self._intake, self._receipts = intake, receipts
-        self._poses, self._health, self._limits = poses, health, limits
-        self._allowed_robots, self._allow_old_stamps = allowed_robots, allow_old_stamps
-        self._max_future_s, self._pose_wait_s = max_future_s, pose_wait_s
-        self._last_stamps: collections.OrderedDict[str, int] = collections.OrderedDict(last_stamps)
+        self._map_id, self._mapper, self._keeper, self._stamps = mapper.map_id, mapper, keeper, stamps
+        self._intake, self._reader, self._receipts, self._health = intake, reader, receipts, health
 
     def run(self) -> None:
         """Work until the intake queue closes."""
@@ -72,7 +60,7 @@ class MapWriter:
             StorageError: the store does not take it. The map is unchanged, as after any error here.
         """
         changed = self._mapper.clear(commit=lambda state: self._keeper.replace(state, {}))
-        self._last_stamps.clear()  # the same log may be replayed into the empty map
+        self._stamps.replace({})  # the same log may be replayed into the empty map
         self._health.count("maps.cleared")
         self._tell(changed)
         log.info("map_cleared", map_id=self._map_id)
@@ -85,7 +73,7 @@ class MapWriter:
             UnsupportedError: the map is kept in memory only.
             StorageError: the store does not take it.
         """
-        done = self._keeper.save(name, self._mapper, self._last_stamps)
+        done = self._keeper.save(name, self._mapper, self._stamps.newest)
         log.info("map_saved", map_id=self._map_id, name=name)
         return done
 
@@ -99,7 +87,7 @@ class MapWriter:
         """
         state, stamps = self._keeper.load(name, self._mapper)
         changed = self._mapper.restore(state, commit=lambda new: self._keeper.replace(new, stamps))
-        self._last_stamps = collections.OrderedDict(stamps)
+        self._stamps.replace(stamps)
         self._health.count("maps.loaded")
         self._tell(changed)
         log.info("map_loaded", map_id=self._map_id, name=name, n_scans=self._mapper.n_scans)
@@ -135,7 +123,7 @@ class MapWriter:
         return f"nothing from {robot_id} is left, {len(changed.tiles)} tiles changed"
 
     def _keep(self, state: MapState) -> None:
-        self._keeper.replace(state, self._last_stamps)
+        self._keeper.replace(state, self._stamps.newest)
 
     def _tell(self, changed: TileChange) -> None:
         snapshot = self._mapper.snapshot
@@ -144,11 +132,8 @@ class MapWriter:
     def _integrate(self, job: CloudJob) -> None:
         wait_ms = job.wait_ms()
         try:
-            scan = codec.decode_cloud(
-                job.payload.to_bytes(), robot_id=job.robot_id, limits=self._limits, pose_at=self._pose_at
-            )
-            codec.check_robot_id(scan.robot_id, self._allowed_robots)
-            self._check_stamp(scan)
+            scan = self._reader.read(job)
+            self._stamps.check(scan.robot_id, scan.stamp_ns)
             started_s = time.perf_counter()
             update = self._mapper.integrate(scan, commit=lambda: self._keeper.append(scan))
         except PotserverError as error:
@@ -159,8 +144,8 @@ class MapWriter:
             self._receipts.refuse(job, PotserverError("a bug of the server; the traceback is in its log"))
             return
         integrate_ms = (time.perf_counter() - started_s) * 1e3
-        self._remember_stamp(scan)
-        self._keeper.advance(self._mapper, self._last_stamps)
+        self._stamps.remember(scan.robot_id, scan.stamp_ns)
+        self._keeper.advance(self._mapper, self._stamps.newest)
         self._health.observe("integrate", integrate_ms)
         self._health.observe("clouds.wait", wait_ms)
         self._receipts.accept(job, scan, update, wait_ms=wait_ms, integrate_ms=integrate_ms)
@@ -177,22 +162,3 @@ class MapWriter:
             wait_ms=round(wait_ms, 1),
             elapsed_ms=round(integrate_ms, 1),
         )
-
-    def _pose_at(self, robot_id: str, stamp_ns: int) -> Float64:
-        return self._poses.at(robot_id, stamp_ns, wait_s=self._pose_wait_s)
-
-    def _check_stamp(self, scan: Scan) -> None:
-        # one wild stamp that we remembered would shut its robot out until the clock reaches it
-        check_not_future(scan.stamp_ns, self._max_future_s)
-        last = self._last_stamps.get(scan.robot_id)
-        if last is not None and scan.stamp_ns <= last and not self._allow_old_stamps:
-            behind_ms = (last - scan.stamp_ns) / 1e6
-            raise OldStampError(
-                f"the stamp is {behind_ms:.3f} ms before the last accepted cloud of {scan.robot_id}"
-            )
-
-    def _remember_stamp(self, scan: Scan) -> None:
-        self._last_stamps[scan.robot_id] = max(scan.stamp_ns, self._last_stamps.get(scan.robot_id, 0))
-        self._last_stamps.move_to_end(scan.robot_id)
-        if len(self._last_stamps) > self._limits.max_robots:
-            self._last_stamps.popitem(last=False)

@@ -3,19 +3,25 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from potschemas.answers import AnswerRule
+from potserver.asking.plan import Plan, checked_box
 from potserver.domain.map_state import MapState
 from potserver.domain.tiles import Tile, TileIndex
-from potserver.domain.types import Float32, Float64, KernelSet
+from potserver.domain.types import Float32, KernelSet
+from potserver.errors import BadPointsError, ShapeError, TooLargeError
+from potserver.limits import Limits
 
 Int64 = NDArray[np.int64]
 
 MANTISSA_BITS = 23  # of a float32
+_LEAST_BITS = 2
+PART_KERNELS = 20_000  # of a part: 200 kB on the wire, at most 800; askers take up to MAX_PART_KERNELS
 
 
 class KnownTiles(NamedTuple):
@@ -24,6 +30,73 @@ class KnownTiles(NamedTuple):
     epoch: int  # of the map that the revisions are of
     indices: Int64  # (N, 3)
     revisions: Int64  # (N,)
+
+
+@dataclasses.dataclass(frozen=True, slots=True, eq=False)
+class Tiles:
+    """What is asked: the tiles that a box touches, where they differ from those that the asker has.
+
+    With `mantissa_bits` of b the latent mean changes by at most 2^-(b + 1) sum_m |weight_mean_m| phi_m, and the probability by
+    at most a quarter of that, beside a relative 2^-(b + 1) of the latent variance.
+    """
+
+    known: KnownTiles | None = None  # what the asker has; None = nothing
+    lower: ArrayLike | None = None  # (3,) m, map frame; None = no bound on that side
+    upper: ArrayLike | None = None  # (3,) m, map frame; likewise
+    mantissa_bits: int = (
+        MANTISSA_BITS  # of each weight's mean and variance, 2 to 23; fewer than 23 are rounded to
+    )
+
+    def plan(
+        self, state: MapState, limits: Limits, *, tile_size_m: float, part_kernels: int = PART_KERNELS
+    ) -> TilesPlan:
+        """Check the question, and compare. A tile without kernels says nothing and counts as none.
+
+        Args:
+            state: Of the map.
+            limits: That the question has to keep.
+            tile_size_m: Edge of a tile where the map has none yet.
+            part_kernels: Of a part, at most.
+        Raises:
+            ShapeError, BadPointsError, OutOfRangeError: an illegal corner, or known tiles of unequal number.
+            TooLargeError: too many known tiles.
+        """
+        lower, upper = checked_box(self.lower, self.upper, limits)
+        self._check_known(limits)
+        if not _LEAST_BITS <= self.mantissa_bits <= MANTISSA_BITS:
+            raise BadPointsError(
+                f"mantissa_bits is {self.mantissa_bits}, need {_LEAST_BITS} to {MANTISSA_BITS}"
+            )
+        tiled = state.tiled
+        size = tile_size_m if tiled is None else tiled.grid.size_m
+        low = None if lower is None else np.floor(lower / size).astype(np.int64)
+        high = None if upper is None else np.floor(upper / size).astype(np.int64)
+        present = {} if tiled is None else _present(tiled.tiles, low, high)
+        is_whole = self.known is None or self.known.epoch != state.epoch
+        revisions = {} if self.known is None or is_whole else _revisions(self.known, low, high)
+        return TilesPlan(
+            epoch=state.epoch,
+            map_revision=state.map_revision,
+            rule=state.snapshot.rule,
+            tile_size_m=size,
+            spacings_m=() if tiled is None else (tiled.grid.coarse_m, tiled.grid.fine_m),
+            is_whole=is_whole,
+            tiles=tuple((i, tile) for i, tile in present.items() if revisions.get(i) != tile.revision),
+            gone=np.array([i for i in revisions if i not in present], np.int64).reshape(-1, 3),
+            mantissa_bits=self.mantissa_bits,
+            part_size=part_kernels,
+        )
+
+    def _check_known(self, limits: Limits) -> None:
+        if self.known is None:
+            return
+        n = len(self.known.indices)
+        if self.known.indices.shape != (n, 3) or self.known.revisions.shape != (n,):
+            raise ShapeError(
+                f"known tiles: {self.known.indices.shape} and {self.known.revisions.shape}, need (N, 3) and (N,)"
+            )
+        if n > limits.max_query_tiles:
+            raise TooLargeError(f"{n} known tiles, the limit is {limits.max_query_tiles}; ask about a box")
 
 
 class TileRun(NamedTuple):
@@ -36,8 +109,8 @@ class TileRun(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class TilesPlan:
-    """The tiles that differ from what the asker has; all parts come from one state of the map, put together when asked for."""
+class TilesPlan(Plan[TileRun]):
+    """The tiles that differ from what the asker has."""
 
     epoch: int
     map_revision: int
@@ -48,25 +121,20 @@ class TilesPlan:
     tiles: tuple[tuple[TileIndex, Tile], ...]  # that differ, each with kernels
     gone: Int64  # (G, 3) tiles that the asker has and the map has not
     mantissa_bits: int
-    part_kernels: int
+    part_size: int
 
     @property
-    def n_kernels(self) -> int:
-        """Of all tiles."""
+    def n_items(self) -> int:
+        """Kernels of all tiles."""
         return sum(len(tile.kernels) for _, tile in self.tiles)
-
-    @property
-    def n_parts(self) -> int:
-        """Parts of at most `part_kernels` kernels; at least one, which may be empty."""
-        return max(1, -(-self.n_kernels // self.part_kernels))
 
     def part(self, i: int) -> TileRun:
         """One run of kernels; a tile may go on in the next."""
         sizes = np.array([len(tile.kernels) for _, tile in self.tiles], np.int64)
         ends = np.cumsum(sizes)
-        first, stop = i * self.part_kernels, (i + 1) * self.part_kernels
-        start = np.maximum(first - (ends - sizes), 0)
-        counts = np.minimum(stop - (ends - sizes), sizes) - start
+        run = self.items(i)
+        start = np.maximum(run.start - (ends - sizes), 0)
+        counts = np.minimum(run.stop - (ends - sizes), sizes) - start
         members = np.flatnonzero(counts > 0)
         kernels = KernelSet.concatenate(
             [
@@ -87,58 +155,6 @@ class TilesPlan:
         )
 
 
-def plan_tiles(
-    state: MapState,
-    known: KnownTiles | None,
-    lower: Float64 | None,
-    upper: Float64 | None,
-    *,
-    tile_size_m: float,
-    mantissa_bits: int,
-    part_kernels: int,
-) -> TilesPlan:
-    """Compare what an asker has with a state of the map. A tile without kernels says nothing and counts as none.
-
-    Args:
-        state: Of the map.
-        known: What the asker has; None = nothing.
-        lower, upper: (3,) m, corners of the box whose tiles are meant, map frame; None = no bound on that side.
-        tile_size_m: Edge of a tile where the map has none yet.
-        mantissa_bits: Of each weight, 2 to 23; fewer than 23 are rounded to.
-        part_kernels: Of a part.
-    """
-    size = tile_size_m if state.tiled is None else state.tiled.grid.size_m
-    low = None if lower is None else np.floor(lower / size).astype(np.int64)
-    high = None if upper is None else np.floor(upper / size).astype(np.int64)
-    present: dict[TileIndex, Tile] = {}
-    if state.tiled is not None:
-        everywhere = {index: tile for index, tile in state.tiled.tiles.items() if len(tile.kernels)}
-        inside = _inside(np.array(list(everywhere), np.int64).reshape(-1, 3), low, high)
-        present = {index: everywhere[index] for index, is_in in zip(everywhere, inside, strict=True) if is_in}
-    is_whole = known is None or known.epoch != state.epoch
-    revisions: dict[TileIndex, int] = {}
-    if known is not None and not is_whole:
-        meant = _inside(known.indices, low, high)
-        revisions = {
-            (x, y, z): revision
-            for (x, y, z), revision in zip(
-                known.indices[meant].tolist(), known.revisions[meant].tolist(), strict=True
-            )
-        }
-    return TilesPlan(
-        epoch=state.epoch,
-        map_revision=state.map_revision,
-        rule=state.snapshot.rule,
-        tile_size_m=size,
-        spacings_m=() if state.tiled is None else (state.tiled.grid.coarse_m, state.tiled.grid.fine_m),
-        is_whole=is_whole,
-        tiles=tuple((i, tile) for i, tile in present.items() if revisions.get(i) != tile.revision),
-        gone=np.array([i for i in revisions if i not in present], np.int64).reshape(-1, 3),
-        mantissa_bits=mantissa_bits,
-        part_kernels=part_kernels,
-    )
-
-
 def rounded(values: Float32, bits: int) -> Float32:
     """Float32 numbers with mantissas of 2 to 22 bits, the nearest ones: off by at most 2^-(bits + 1) of themselves.
 
@@ -149,6 +165,20 @@ def rounded(values: Float32, bits: int) -> Float32:
     raw = values.view(np.uint32)
     up = ((raw + np.uint32(1 << (dropped - 1))) & keep).view(np.float32)
     return np.where(np.isfinite(up), up, (raw & keep).view(np.float32))
+
+
+def _present(tiles: Mapping[TileIndex, Tile], low: Int64 | None, high: Int64 | None) -> dict[TileIndex, Tile]:
+    """The tiles in a box that have kernels."""
+    everywhere = {index: tile for index, tile in tiles.items() if len(tile.kernels)}
+    inside = _inside(np.array(list(everywhere), np.int64).reshape(-1, 3), low, high)
+    return {index: everywhere[index] for index, is_in in zip(everywhere, inside, strict=True) if is_in}
+
+
+def _revisions(known: KnownTiles, low: Int64 | None, high: Int64 | None) -> dict[TileIndex, int]:
+    """What the asker has in a box."""
+    meant = _inside(known.indices, low, high)
+    pairs = zip(known.indices[meant].tolist(), known.revisions[meant].tolist(), strict=True)
+    return {(x, y, z): revision for (x, y, z), revision in pairs}
 
 
 def _inside(index: Int64, low: Int64 | None, high: Int64 | None) -> NDArray[np.bool_]:

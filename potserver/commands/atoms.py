@@ -131,7 +131,8 @@ def _draw(dictionary: AtomDictionary, options: argparse.Namespace, *, title: str
 
 
 def _export(options: argparse.Namespace) -> int:
-    from potserver.adapters import codec
+    from potschemas import wire
+    from potserver.codec.atoms import encode_atom
     from potserver.mapping.service import method_of
 
     settings = settings_of(options)
@@ -142,14 +143,14 @@ def _export(options: argparse.Namespace) -> int:
     with file_errors(f"write to {folder}"):
         folder.mkdir(parents=True, exist_ok=True)
         for atom in atoms:
-            (folder / f"{atom.atom_id}.atom").write_bytes(codec.encode_atom(atom, {}, rule).payload)
+            (folder / f"{atom.atom_id}.atom").write_bytes(wire.encode(encode_atom(atom, {}, rule)))
     say(f"{len(atoms)} atoms written to {folder}")
     return EXIT_OK
 
 
 def _import(options: argparse.Namespace) -> int:
-    from potserver.adapters import codec
     from potserver.atoms.admission import admit
+    from potserver.codec.atoms import read_atom_file
     from potserver.domain.dictionary import AtomDictionary
 
     out = Path(options.out)
@@ -158,7 +159,7 @@ def _import(options: argparse.Namespace) -> int:
         with file_errors(f"read {name}"):
             content = Path(name).read_bytes()
         try:
-            atom = codec.read_atom_file(content)
+            atom = read_atom_file(content)
             admit(atom, dictionary)
         except PotserverError as error:
             raise SettingsError(f"{name}: {error}") from error

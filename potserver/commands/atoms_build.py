@@ -79,7 +79,7 @@ def add(commands: Any) -> None:
 
 
 def _run(options: argparse.Namespace) -> int:
-    from potserver.adapters.log import configure_logging
+    from potserver.log import configure_logging
 
     configure_logging("warning", "console")
     try:

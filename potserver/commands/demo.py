@@ -99,8 +99,8 @@ def add(commands: Any) -> None:
 
 def _run(options: argparse.Namespace) -> int:
     """Map and score; EXIT_OK when every scan was accepted and all files are written."""
-    from potserver.adapters.log import configure_logging
     from potserver.config import Settings
+    from potserver.log import configure_logging
     from potserver.mapping.settings import MappingSettings
     from potserver.server import MapServer
 

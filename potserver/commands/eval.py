@@ -117,7 +117,7 @@ def _add_beam_flags(beams: Any) -> None:
 
 def _run(options: argparse.Namespace) -> int:
     """Evaluate on every dataset: tables as they are known, files at the end."""
-    from potserver.adapters.log import configure_logging
+    from potserver.log import configure_logging
     from potserver.numerics.threads import default_threads
 
     settings = settings_of(options)

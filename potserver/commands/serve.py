@@ -58,7 +58,7 @@ def add(commands: Any) -> None:
 def _run(options: argparse.Namespace) -> int:
     import zenoh
 
-    from potserver.adapters.log import configure_logging, get_logger
+    from potserver.log import configure_logging, get_logger
 
     settings = settings_of(options)
     configure_logging(settings.log.level, settings.log.format)

@@ -10,9 +10,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from potclient import results
 from potclient.kernels import KernelSet as ClientKernels
-from potschemas import messages, wire
-from potserver.adapters import codec
-from potserver.asking.service import GridPlan
+from potschemas import messages
+from potserver.adapters.questions.info import encode_limits, snapshot_fields
+from potserver.asking.grid import GridPlan
+from potserver.codec.kernels import encode_kernels
 from potserver.limits import Limits
 from potserver.mapping.settings import MappingSettings
 from potserver.storage.map_file import SavedMap
@@ -29,22 +30,20 @@ class UnservedMap:
     def info(self) -> messages.Info:
         """What the map is."""
         r = self._record
-        encoded = codec.encode_info(
-            server_id="unserved",
+        return messages.Info(
+            server="unserved",
             version=r.written_by,
-            map_id=r.map_id,
+            map=r.map_id,
             maps=[r.map_id],
             profile="default" if r.keeps_evidence else "paper",
-            snapshot=self._map,
             n_atoms=0,
             n_scans=r.n_scans,
-            tile_size_m=r.grid[0] if r.grid else MappingSettings().tile_size_m,
-            max_range_m=0.0,
-            limits=Limits(),
+            tile_size_m=float(r.grid[0] if r.grid else MappingSettings().tile_size_m),
+            limits=encode_limits(Limits(), max_range_m=0.0),
             started_ns=r.written_ns,
             durable=True,
+            **snapshot_fields(self._map),
         )
-        return wire.decode(encoded.payload, messages.Info)
 
     def params_parts(
         self, lower: ArrayLike | None = None, upper: ArrayLike | None = None
@@ -55,7 +54,7 @@ class UnservedMap:
         for number, kernels in enumerate(self._parts):
             hinge = kernels.hinge_mean
             inside = np.flatnonzero(((hinge >= low) & (hinge <= high)).all(axis=1))
-            message = codec.encode_kernels(kernels.take(inside), self._map.rule)
+            message = encode_kernels(kernels.take(inside), self._map.rule)
             yield (
                 number,
                 len(self._parts),
@@ -66,8 +65,8 @@ class UnservedMap:
         """Occupancy at the cell centres of a box, m, map frame."""
         low, high = np.asarray(lower, np.float64), np.asarray(upper, np.float64)
         nx, ny, nz = (int(n) for n in np.ceil((high - low) / resolution - 1e-6))
-        plan = GridPlan(self._map, low, resolution, (nx, ny, nz), part_cells=nx * ny * nz)
-        _, o = plan.part(0)
+        plan = GridPlan(self._map, low, resolution, (nx, ny, nz), nx * ny * nz)
+        o = plan.part(0).occupancy
 
         def cells(array: NDArray[Any]) -> NDArray[np.float32]:
             return array.astype(np.float32).reshape(nx, ny, nz)

@@ -157,7 +157,7 @@ class KernelMap:
         unknown: Unknown,
         width_m: float | None,
     ) -> rays.FirstReturns:
-        """Where rays end, see `numerics.rays`; inputs are checked by `QueryService.rays`."""
+        """Where rays end, see `numerics.rays`; inputs are checked by `asking.rays`."""
         width_of_unknown = self.typical_width_m if width_m is None else width_m
         rate = {
             Unknown.FREE: 0.0,

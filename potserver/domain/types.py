@@ -262,39 +262,6 @@ class Unknown(str, Enum):
     PRIOR = "prior"  # as the map answers for it: occupied with probability 0.5
 
 
-@dataclasses.dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class RayReturns:
-    """Where N rays end: the distribution of min(first return, maximum range). Ranges from the rays' origins, m."""
-
-    hit_probability: Float64  # (N,) of a return before the maximum range
-    mean_m: Float64  # (N,)
-    std_m: Float64  # (N,)
-    quantile_m: Float64  # (N, Q); the maximum range, where a return before it is too unlikely
-    unknown_range_m: Float64  # (N,) where the ray first enters unobserved space; NaN: nowhere before it ends
-    unknown_share: Float64  # (N,) of the ray's expected length, in unobserved space
-    step_m: float  # of the summation, at most
-    map_revision: int
-
-
-@dataclasses.dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class PathRisk:
-    """How likely a robot on P poses touches something.
-
-    The truth of the joint probability lies between `max_probability`, where all cells are one trial, and the sum of them all;
-    `union_probability` takes cells as independent beyond the correlation length.
-    """
-
-    max_probability: Float64  # (P,) of the likeliest cell that the robot covers
-    union_probability: Float64  # (P,) that any of its cells is occupied
-    unknown_share: Float64  # (P,) of its cells, unobserved
-    path_max_probability: float
-    path_union_probability: float  # every cell of the swept volume counted once
-    path_unknown_share: float
-    n_cells: int  # of the swept volume
-    resolution_m: float  # edge of a cell
-    map_revision: int
-
-
 class TileChange(NamedTuple):
     """Which cubes of the map a scan touched."""
 

@@ -15,9 +15,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
 
-from potserver.adapters import codec
-from potserver.adapters.log import get_logger
-from potserver.adapters.threads import spawn
+from potserver.codec.clouds import encode_cloud, read_cloud
 from potserver.domain.map_state import MapState
 from potserver.domain.types import Scan
 from potserver.errors import (
@@ -29,9 +27,11 @@ from potserver.errors import (
     UnsupportedError,
 )
 from potserver.health import Health
+from potserver.log import get_logger
 from potserver.mapping.service import MappingService
 from potserver.storage.journal import Journal
 from potserver.storage.map_file import MapFile, Origin, SavedMap, read_map, write_map
+from potserver.threads import spawn
 
 log = get_logger("potserver.store")
 
@@ -183,7 +183,7 @@ class MapStore:
         done = 0
         for number, payload in self._journal.scans(self._taken):
             try:
-                scan = codec.read_cloud(payload)
+                scan = read_cloud(payload)
                 mapper.integrate(scan)
             except PotserverError as error:
                 raise MapFileError(
@@ -208,7 +208,7 @@ class MapStore:
             StorageError: the disk refuses; the scan must not enter the map.
         """
         started_s = time.perf_counter()
-        payload = codec.encode_cloud(scan)
+        payload = encode_cloud(scan)
         try:
             self._journal.append(payload, prune_to=self._taken)
         except StorageError:

@@ -6,6 +6,7 @@ import collections
 import threading
 
 import pytest
+import zenoh
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -13,19 +14,8 @@ from potserver.adapters.intake import Barrier, CloudJob, IntakeQueue
 from potserver.errors import OverloadedError, PotserverError, ShuttingDownError
 
 
-class Bytes:
-    def __init__(self, n: int) -> None:
-        self._n = n
-
-    def __len__(self) -> int:
-        return self._n
-
-    def to_bytes(self) -> bytes:
-        return bytes(self._n)
-
-
 def job(robot: str | None = "r", n_bytes: int = 10) -> CloudJob:
-    return CloudJob(robot_id=robot, payload=Bytes(n_bytes))
+    return CloudJob(robot_id=robot, payload=zenoh.ZBytes(bytes(n_bytes)))
 
 
 def queue_of(n: int = 4, n_bytes: int = 1000) -> IntakeQueue:

@@ -80,11 +80,11 @@ def test_outside_the_buffer_there_is_no_pose(robot: str, ms: int, why: str) -> N
 
 
 def test_a_late_pose_is_waited_for() -> None:
-    poses = PoseBuffer()
+    poses = PoseBuffer(wait_s=30)
     poses.add("r", 10 * MS, yaw_pose(1, 0, 0))
     later = threading.Timer(0.01, lambda: poses.add("r", 20 * MS, yaw_pose(3, 0, 0)))
     later.start()
-    assert poses.at("r", 15 * MS, wait_s=30)[0, 3] == pytest.approx(2.0)
+    assert poses.at("r", 15 * MS)[0, 3] == pytest.approx(2.0)
     later.join()
 
 

@@ -9,14 +9,12 @@ import pytest
 
 from potclient.kernels import KernelSet as ClientKernels
 from potschemas.answers import AnswerRule
-from potserver.adapters import codec
-from potserver.asking.service import QueryService
-from potserver.domain.dictionary import AtomDictionary
+from potserver.asking.points import Points
+from potserver.codec.kernels import encode_kernels
 from potserver.domain.kernel_map import KernelMap
-from potserver.domain.map_state import MapState
 from potserver.domain.types import KernelSet
 from potserver.errors import BadPointsError
-from potserver.mapping.service import MappingService
+from potserver.limits import Limits
 from tests.conformance import reference
 
 Array = np.ndarray[Any, Any]
@@ -80,7 +78,7 @@ def test_gradients_are_the_central_differences(residual_var: float) -> None:
 @pytest.mark.parametrize("shift_m", [0.0, 3e6])
 def test_offline_gradients_are_the_servers(shift_m: float) -> None:
     kernels = scene(shift_m=shift_m)
-    message = codec.encode_kernels(kernels.kernels, kernels.rule)
+    message = encode_kernels(kernels.kernels, kernels.rule)
     offline = ClientKernels.from_message(message)
     points = np.random.default_rng(0).uniform(-7, 7, (800, 3)) + shift_m
     here, there = offline.occupancy(points, gradient=True), kernels.occupancy_with_gradient(points)
@@ -99,7 +97,7 @@ def test_offline_gradients_are_the_servers(shift_m: float) -> None:
 def test_offline_gradients_are_exact_in_float64() -> None:
     """The client sums in float64: only the differences themselves limit what can be seen."""
     kernels = scene(k=60)
-    offline = ClientKernels.from_message(codec.encode_kernels(kernels.kernels, kernels.rule))
+    offline = ClientKernels.from_message(encode_kernels(kernels.kernels, kernels.rule))
     k = kernels.kernels
     exact = KernelMap(
         KernelSet(
@@ -129,11 +127,10 @@ def test_an_empty_map_is_flat() -> None:
     assert KernelMap(KernelSet.empty()).occupancy_with_gradient(np.zeros((0, 3))).gradient.shape == (0, 3)
 
 
-def test_the_service_gives_them_on_request() -> None:
-    mapping = MappingService(AtomDictionary(()), threads=1)
-    mapping.state = MapState(snapshot=scene())
-    service = QueryService(mapping)
-    assert service.occupancy([[0.0, 0, 0]]).gradient is None
-    assert service.occupancy([[0.0, 0]], with_gradient=True).gradient.shape == (1, 3)
+def test_points_get_them_on_request() -> None:
+    kernels, limits = scene(), Limits()
+    assert Points([[0.0, 0, 0]]).plan(kernels, limits).part(0).gradient is None
+    answer = Points([[0.0, 0]], with_gradient=True).plan(kernels, limits).part(0)
+    assert answer.gradient.shape == (1, 3)
     with pytest.raises(BadPointsError):
-        service.occupancy([[np.nan, 0, 0]], with_gradient=True)
+        Points([[np.nan, 0, 0]], with_gradient=True).plan(kernels, limits)

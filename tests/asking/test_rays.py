@@ -10,30 +10,22 @@ import pytest
 
 from potclient.towns import open_town
 from potschemas.answers import AnswerRule
-from potserver.asking.service import QueryService
-from potserver.domain.dictionary import AtomDictionary
+from potserver.asking.rays import RayReturns, Rays
 from potserver.domain.kernel_map import KernelMap
-from potserver.domain.map_state import MapState
-from potserver.domain.types import KernelSet, RayReturns, Scan, Unknown
+from potserver.domain.types import KernelSet, Scan, Unknown
 from potserver.errors import BadPointsError, OutOfRangeError, ShapeError, TooLargeError
+from potserver.limits import Limits
 from potserver.mapping.service import MappingService
-from potserver.numerics import gradients, lattice, rays
 from tests.conformance import reference
 
 Array = np.ndarray[Any, Any]
 
 
-def service_of(kernels: KernelMap, **limits: Any) -> QueryService:
-    mapping = MappingService(AtomDictionary(()), threads=1)
-    mapping.state = MapState(snapshot=kernels)
-    return QueryService(mapping, **limits)
-
-
 def cast(
     kernels: KernelMap, origins: Any, directions: Any, max_range_m: float = 10.0, **options: Any
 ) -> RayReturns:
-    plan = service_of(kernels).rays(origins, directions, max_range_m, **options)
-    return plan.result(plan.part(i) for i in range(plan.n_parts))
+    plan = Rays(origins, directions, max_range_m, **options).plan(kernels, Limits())
+    return plan.result(plan.parts())
 
 
 def scene(k: int = 300, seed: int = 0, *, shift_m: float = 0.0, **rule: float) -> KernelMap:
@@ -230,9 +222,9 @@ def test_parts_and_threads_do_not_matter() -> None:
     origins, directions = some_rays(50)
     kernels = scene()
     many = KernelMap(kernels.kernels, rule=kernels.rule, threads=3)
-    plan = service_of(many).rays(origins, directions, 10.0, part_samples=300)
+    plan = Rays(origins, directions, 10.0).plan(many, Limits(), part_samples=300)
     assert plan.n_parts > 5
-    answer = plan.result(plan.part(i) for i in range(plan.n_parts))
+    answer = plan.result(plan.parts())
     np.testing.assert_array_equal(answer.mean_m, cast(kernels, origins, directions).mean_m)
 
 
@@ -289,22 +281,11 @@ def test_the_medians_are_near_the_truth_of_a_town() -> None:
     assert inside.mean() > 0.8, "nine in ten, were the map perfect"
 
 
-def test_whatever_is_asked_needs_no_other_compilation_than_the_warm_up() -> None:
-    """A first question that compiles would take seconds; received arrays are read-only, and options may be integers."""
-    service = service_of(scene())
-    service.warm_up()
-    received = np.frombuffer(np.ones(6).tobytes()).reshape(2, 3)
-    plan = service.rays(received, received.astype(np.float32), 5, unknown=Unknown.OCCUPIED, width_m=1)
-    plan.result([plan.part(0)])
-    pose = np.frombuffer(np.eye(4).tobytes()).reshape(1, 4, 4)
-    risk = service.risk(pose, np.array([[0, 0, 0, 1], [1, 0, 0, 2]]), dims=2, resolution_m=1)
-    risk.result([risk.part(0)])
-    service.occupancy(received, with_gradient=True)
-    for compiled in (rays._march, lattice._cover, gradients._gradient_cubes):
-        assert len(compiled.signatures) == 1
-
-
 # --- what is refused -----------------------------------------------------------------------------------------------
+
+
+class FewRays(Limits):
+    max_query_rays = 10
 
 
 @pytest.mark.parametrize(
@@ -315,7 +296,7 @@ def test_whatever_is_asked_needs_no_other_compilation_than_the_warm_up() -> None
         ({"directions": [[0.0, 0, 0]]}, BadPointsError, "no length"),
         ({"directions": [[1.0, 0, 0]] * 2}, ShapeError, "1 origins and 2"),
         ({"origins": [0.0, 0, 0]}, ShapeError, "need"),
-        ({"origins": [[2e7, 0, 0]]}, OutOfRangeError, "limit"),
+        ({"origins": [[2.1e7, 0, 0]]}, OutOfRangeError, "limit"),
         ({"max_range_m": 0.0}, BadPointsError, "max_range_m"),
         ({"max_range_m": np.nan}, BadPointsError, "max_range_m"),
         ({"max_range_m": 1e9}, OutOfRangeError, "limit"),
@@ -331,16 +312,16 @@ def test_whatever_is_asked_needs_no_other_compilation_than_the_warm_up() -> None
     ],
 )
 def test_bad_rays(changes: dict[str, Any], error: type[Exception], message: str) -> None:
-    service = service_of(scene(), max_rays=10, max_samples=400)
+    kernels, limits = scene(), FewRays(max_query_samples=400)
     arguments: dict[str, Any] = {
         "origins": [[0.0, 0, 0]],
         "directions": [[1.0, 0, 0]],
         "max_range_m": 5.0,
         "step_m": 0.1,
     }
-    service.rays(**arguments)
+    Rays(**arguments).plan(kernels, limits)
     with pytest.raises(error, match=message):
-        service.rays(**(arguments | changes))
+        Rays(**(arguments | changes)).plan(kernels, limits)
 
 
 def test_directions_of_any_length_and_of_two_dimensions() -> None:

@@ -10,28 +10,22 @@ import numpy as np
 import pytest
 
 from potschemas.answers import AnswerRule
-from potserver.asking.service import QueryService
-from potserver.domain.dictionary import AtomDictionary
+from potserver.asking.risk import PART_CELLS, PathRisk, Risk
 from potserver.domain.kernel_map import KernelMap
-from potserver.domain.map_state import MapState
-from potserver.domain.types import KernelSet, PathRisk, Unknown
+from potserver.domain.types import KernelSet, Unknown
 from potserver.errors import BadPointsError, BadPoseError, OutOfRangeError, ShapeError, TooLargeError
-from potserver.mapping.service import MappingService
+from potserver.limits import Limits
 from potserver.numerics.lattice import covered_cells, most_cells
 
 Array = np.ndarray[Any, Any]
 CUT = 1e-4  # by so little a probability may depend on what is asked together: the kernels' cut
 
 
-def service_of(kernels: KernelMap, **limits: Any) -> QueryService:
-    mapping = MappingService(AtomDictionary(()), threads=1)
-    mapping.state = MapState(snapshot=kernels)
-    return QueryService(mapping, **limits)
-
-
-def assess(kernels: KernelMap, path: Any, spheres: Any, **options: Any) -> PathRisk:
-    plan = service_of(kernels).risk(path, spheres, **options)
-    return plan.result(plan.part(i) for i in range(plan.n_parts))
+def assess(
+    kernels: KernelMap, path: Any, spheres: Any, *, part_cells: int = PART_CELLS, **options: Any
+) -> PathRisk:
+    plan = Risk(path, spheres, **options).plan(kernels, Limits(), part_cells=part_cells)
+    return plan.result(plan.parts())
 
 
 def scene(seed: int = 0, k: int = 250) -> KernelMap:
@@ -213,13 +207,18 @@ def _tilted() -> Array:
     return pose
 
 
+class SmallRobots(Limits):
+    max_query_poses = 3
+    max_query_spheres = 5
+
+
 @pytest.mark.parametrize(
     ("changes", "error", "message"),
     [
         ({"path": np.eye(4)}, ShapeError, "path"),
         ({"path": _tilted()}, BadPoseError, "rigid|rotation|orthonormal"),
         ({"path": poses((np.nan, 0, 0))}, BadPoseError, "."),
-        ({"path": poses((1.5e7, 0, 0))}, OutOfRangeError, "limit"),
+        ({"path": poses((2.5e7, 0, 0))}, OutOfRangeError, "limit"),
         ({"path": poses(*[(0.0, 0, 0)] * 4)}, TooLargeError, "4 poses"),
         ({"spheres": [[0, 0, 0]]}, ShapeError, "spheres"),
         ({"spheres": np.zeros((0, 4))}, ShapeError, "at least 1"),
@@ -235,8 +234,8 @@ def _tilted() -> Array:
     ],
 )
 def test_bad_questions(changes: dict[str, Any], error: type[Exception], message: str) -> None:
-    service = service_of(scene(), max_poses=3, max_spheres=5, max_samples=5000)
+    kernels, limits = scene(), SmallRobots(max_query_samples=5000)
     arguments: dict[str, Any] = {"path": poses((0.0, 0, 0)), "spheres": [[0, 0, 0, 0.5]]}
-    service.risk(**arguments)
+    Risk(**arguments).plan(kernels, limits)
     with np.errstate(over="ignore"), pytest.raises(error, match=message):
-        service.risk(**(arguments | changes))
+        Risk(**(arguments | changes)).plan(kernels, limits)

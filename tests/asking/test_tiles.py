@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 import pytest
 
-from potserver.asking.service import QueryService
-from potserver.asking.tiles import KnownTiles, TilesPlan, rounded
-from potserver.domain.dictionary import AtomDictionary
+from potserver.asking.tiles import KnownTiles, Tiles, TilesPlan, rounded
 from potserver.domain.map_state import MapState
 from potserver.domain.types import KernelSet
 from potserver.errors import BadPointsError, OutOfRangeError, ShapeError, TooLargeError
-from potserver.mapping.service import MappingService
+from potserver.limits import Limits
 from tests.tiled_maps import GRID, free_kernels, lattice_kernels, tiled_state
 
 TILES = {
@@ -23,16 +22,18 @@ TILES = {
 }
 
 
-@pytest.fixture
-def mapping() -> MappingService:
-    service = MappingService(AtomDictionary(()), threads=1)
-    service.state = tiled_state(TILES, epoch=9, revision=7)
-    return service
+STATE = tiled_state(TILES, epoch=9, revision=7)
 
 
-@pytest.fixture
-def query(mapping: MappingService) -> QueryService:
-    return QueryService(mapping, max_known_tiles=4, max_coordinate_m=1e4)
+class FewTiles(Limits):
+    max_query_tiles = 4
+
+
+def plan_of(
+    known: KnownTiles | None = None, *, state: MapState = STATE, part_kernels: int = 20_000, **asked: Any
+) -> TilesPlan:
+    limits = FewTiles(max_coordinate_m=1e4)
+    return Tiles(known, **asked).plan(state, limits, tile_size_m=GRID.size_m, part_kernels=part_kernels)
 
 
 def known(*tiles: tuple[int, int, int, int], epoch: int = 9) -> KnownTiles:
@@ -44,8 +45,8 @@ def sent(plan: TilesPlan) -> set[tuple[int, int, int]]:
     return {index for index, _ in plan.tiles}
 
 
-def test_who_knows_nothing_gets_everything(query: QueryService) -> None:
-    plan = query.tiles()
+def test_who_knows_nothing_gets_everything() -> None:
+    plan = plan_of()
     assert (plan.is_whole, plan.epoch, plan.map_revision, plan.n_parts) == (True, 9, 7, 1)
     assert sent(plan) == set(TILES)
     run = plan.part(0)
@@ -56,70 +57,62 @@ def test_who_knows_nothing_gets_everything(query: QueryService) -> None:
     np.testing.assert_array_equal(run.kernels.weight_mean, whole.weight_mean)
 
 
-def test_only_tiles_of_another_revision_are_sent_and_those_gone_are_named(query: QueryService) -> None:
-    plan = query.tiles(known((0, 0, 0, 3), (1, 0, 0, 4), (5, 5, 5, 2)))
+def test_only_tiles_of_another_revision_are_sent_and_those_gone_are_named() -> None:
+    plan = plan_of(known((0, 0, 0, 3), (1, 0, 0, 4), (5, 5, 5, 2)))
     assert not plan.is_whole
     assert sent(plan) == {(1, 0, 0), (-1, 2, 0)}
     assert plan.gone.tolist() == [[5, 5, 5]]
     # a revision that is ahead of ours is another one too
-    assert sent(query.tiles(known((0, 0, 0, 4)))) == set(TILES)
+    assert sent(plan_of(known((0, 0, 0, 4)))) == set(TILES)
 
 
-def test_of_another_epoch_nothing_is_known(query: QueryService) -> None:
-    plan = query.tiles(known((0, 0, 0, 3), (5, 5, 5, 2), epoch=8))
+def test_of_another_epoch_nothing_is_known() -> None:
+    plan = plan_of(known((0, 0, 0, 3), (5, 5, 5, 2), epoch=8))
     assert plan.is_whole
     assert sent(plan) == set(TILES)
     assert len(plan.gone) == 0
 
 
-def test_a_box_means_the_tiles_that_it_touches(query: QueryService) -> None:
+def test_a_box_means_the_tiles_that_it_touches() -> None:
     size = GRID.size_m
     box = {"lower": [0.5, 0.5, 0.5], "upper": [size, 1.0, 1.0]}
     everything = ((0, 0, 0, 1), (1, 0, 0, 1), (-1, 2, 0, 1), (2, 0, 0, 1))
-    assert sent(query.tiles(**box)) == {(0, 0, 0), (1, 0, 0)}
-    plan = query.tiles(known(*everything), **box)
+    assert sent(plan_of(**box)) == {(0, 0, 0), (1, 0, 0)}
+    plan = plan_of(known(*everything), **box)
     assert sent(plan) == {(0, 0, 0), (1, 0, 0)}
     assert len(plan.gone) == 0, "tiles beyond the box are neither sent nor gone"
-    assert sent(query.tiles(upper=[-0.1, 99.0, 99.0])) == {(-1, 2, 0)}
-    assert query.tiles(known(*everything), lower=[size, 0, 0]).gone.tolist() == [[2, 0, 0]]
+    assert sent(plan_of(upper=[-0.1, 99.0, 99.0])) == {(-1, 2, 0)}
+    assert plan_of(known(*everything), lower=[size, 0, 0]).gone.tolist() == [[2, 0, 0]]
 
 
-def test_a_tile_without_kernels_is_none(query: QueryService, mapping: MappingService) -> None:
-    mapping.state = tiled_state(TILES | {(0, 0, 0): (KernelSet.empty(), 8)}, epoch=9, revision=8)
-    plan = query.tiles(known((0, 0, 0, 3)))
+def test_a_tile_without_kernels_is_none() -> None:
+    state = tiled_state(TILES | {(0, 0, 0): (KernelSet.empty(), 8)}, epoch=9, revision=8)
+    plan = plan_of(known((0, 0, 0, 3)), state=state)
     assert (0, 0, 0) not in sent(plan)
     assert plan.gone.tolist() == [[0, 0, 0]]
 
 
-def test_an_empty_map_has_no_tiles(query: QueryService, mapping: MappingService) -> None:
-    mapping.state = dataclasses.replace(tiled_state({}, epoch=9), tiled=None)
-    plan = query.tiles(known((0, 0, 0, 3)))
-    assert plan.tile_size_m == mapping.settings.tile_size_m
+def test_an_empty_map_has_no_tiles() -> None:
+    plan = plan_of(known((0, 0, 0, 3)), state=dataclasses.replace(tiled_state({}, epoch=9), tiled=None))
+    assert plan.tile_size_m == GRID.size_m
     assert (plan.n_parts, plan.gone.tolist()) == (1, [[0, 0, 0]])
     run = plan.part(0)
     assert (len(run.kernels), len(run.counts), run.indices.shape) == (0, 0, (0, 3))
 
 
 @pytest.mark.parametrize("part_kernels", [1, 7, 30, 119, 120, 500])
-def test_parts_hold_no_more_than_asked_for_and_together_all(query: QueryService, part_kernels: int) -> None:
-    plan = query.tiles(part_kernels=part_kernels)
+def test_parts_hold_no_more_than_asked_for_and_together_all(part_kernels: int) -> None:
+    plan = plan_of(part_kernels=part_kernels)
     runs = [plan.part(i) for i in range(plan.n_parts)]
     assert plan.n_parts == -(-120 // part_kernels)
     assert all(0 < len(run.kernels) == run.counts.sum() <= part_kernels for run in runs)
-    together, whole = KernelSet.concatenate([run.kernels for run in runs]), query.tiles().part(0)
+    together, whole = KernelSet.concatenate([run.kernels for run in runs]), plan_of().part(0)
     np.testing.assert_array_equal(together.hinge_mean, whole.kernels.hinge_mean)
     counts: dict[tuple[int, ...], int] = {}
     for run in runs:
         for index, n in zip(run.indices.tolist(), run.counts.tolist(), strict=True):
             counts[tuple(index)] = counts.get(tuple(index), 0) + n
     assert counts == {index: len(kernels) for index, (kernels, _) in TILES.items()}
-
-
-def test_all_parts_come_from_one_state(query: QueryService, mapping: MappingService) -> None:
-    plan = query.tiles(part_kernels=40)
-    before = plan.part(2)
-    mapping.state = MapState(snapshot=mapping.state.snapshot)
-    np.testing.assert_array_equal(plan.part(2).kernels.hinge_mean, before.kernels.hinge_mean)
 
 
 @pytest.mark.parametrize(
@@ -135,9 +128,9 @@ def test_all_parts_come_from_one_state(query: QueryService, mapping: MappingServ
         ({"mantissa_bits": 24}, BadPointsError),
     ],
 )
-def test_bad_questions(query: QueryService, arguments: dict, error: type[Exception]) -> None:
+def test_bad_questions(arguments: dict, error: type[Exception]) -> None:
     with pytest.raises(error):
-        query.tiles(**arguments)
+        plan_of(**arguments)
 
 
 @pytest.mark.parametrize("bits", [2, 7, 10, 22])
@@ -163,9 +156,8 @@ def test_rounding_keeps_zero_and_makes_nothing_infinite() -> None:
 
 def test_fewer_bits_change_answers_by_no_more_than_was_promised() -> None:
     kernels, bits = lattice_kernels(2000), 6
-    query = QueryService(MappingService(AtomDictionary(()), threads=1))
-    query._mapping.state = tiled_state({(0, 0, 0): (kernels, 1)})
-    short = query.tiles(mantissa_bits=bits).part(0).kernels
+    state = tiled_state({(0, 0, 0): (kernels, 1)})
+    short = plan_of(state=state, mantissa_bits=bits).part(0).kernels
     points = np.random.default_rng(0).uniform(1, 7, (200, 3))
     squared = ((points[:, None] - kernels.hinge_mean) ** 2).sum(axis=2)
     phi = np.exp(-kernels.gamma.astype(np.float64) * squared)

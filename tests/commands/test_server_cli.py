@@ -18,11 +18,11 @@ import pytest
 
 from potclient.atoms import Atom
 from potserver import cli
-from potserver.adapters.log import configure_logging, get_logger
 from potserver.commands.config import to_toml
 from potserver.commands.serve import StopSignals
 from potserver.config import Leaf, Settings, as_tree, load_settings
 from potserver.domain.dictionary import AtomDictionary
+from potserver.log import configure_logging, get_logger
 
 
 @pytest.fixture(autouse=True)

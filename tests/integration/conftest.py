@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import collections
 import contextlib
+import dataclasses
 import json
 import queue
 import threading
@@ -18,10 +19,9 @@ import zenoh
 from potschemas import messages, wire
 from potschemas.answers import AnswerRule
 from potschemas.keys import MapKeys, stats_key
-from potserver.asking.service import QueryService
 from potserver.config import Settings, load_settings
 from potserver.domain.dictionary import AtomDictionary
-from potserver.domain.running_scores import RunningScores
+from potserver.domain.map_state import MapState
 from potserver.domain.types import KernelSet, MapUpdate, Occupancy, Scan, TileChange
 from potserver.mapping.settings import MappingSettings
 from potserver.server import MapServer
@@ -167,6 +167,48 @@ def points_query(points: Any, **changes: Any) -> messages.PointsQuery:
     return messages.PointsQuery(points=wire.encode_array(np.asarray(points, np.float64)), **changes)
 
 
+def in_background(work: Callable[[], Any]) -> Callable[[], Any]:
+    """Start work on a thread; the result waits for it and returns its value or raises its error."""
+    outcome: queue.Queue[tuple[Any, BaseException | None]] = queue.Queue()
+
+    def run() -> None:
+        try:
+            outcome.put((work(), None))
+        except BaseException as error:
+            outcome.put((None, error))
+
+    threading.Thread(target=run, daemon=True).start()
+
+    def result() -> Any:
+        value, error = outcome.get(timeout=DEADLINE_S)
+        if error is not None:
+            raise error
+        return value
+
+    return result
+
+
+def drain(inbox: queue.Queue[Any], n: int) -> list[Any]:
+    """The next `n` messages."""
+    return [inbox.get(timeout=DEADLINE_S) for _ in range(n)]
+
+
+def balance(counters: dict[str, int]) -> int:
+    """Clouds received less clouds that ended."""
+    ended = sum(
+        n
+        for name, n in counters.items()
+        if name.startswith(("clouds.accepted", "clouds.rejected.", "clouds.dropped."))
+    )
+    return counters["clouds.received"] - ended
+
+
+def pose_message(stamp_ns: int, x_m: float) -> messages.Pose:
+    pose = np.eye(4)
+    pose[0, 3] = x_m
+    return messages.Pose(stamp_ns=stamp_ns, T_map_sensor=wire.encode_array(pose))
+
+
 # --- a mapper without mathematics, that can be held ---------------------------------------------------------
 
 
@@ -217,16 +259,27 @@ class Gate:
 class FakeMapper:
     """Takes every fifth point as a kernel."""
 
-    def __init__(self) -> None:
+    def __init__(self, map_id: str = "default") -> None:
+        self.map_id = map_id
         self.settings = MappingSettings()
         self.dictionary = AtomDictionary(())
         self.atom_usage: collections.Counter[str] = collections.Counter()
-        self.n_scans = 0
-        self.scores = RunningScores()
-        self.snapshot = FakeSnapshot(self, KernelSet.empty(), 0)
+        self.state = MapState(snapshot=FakeSnapshot(self, KernelSet.empty(), 0))  # type: ignore[arg-type]
         self.scans: list[Scan] = []
         self.failure: Exception | None = None
         self.mapping, self.queries, self.warming = Gate(), Gate(), Gate()
+
+    @property
+    def snapshot(self) -> Any:
+        return self.state.snapshot
+
+    @property
+    def n_scans(self) -> int:
+        return self.state.n_scans
+
+    def _become(self, kernels: KernelSet, n_scans: int) -> None:
+        snapshot: Any = FakeSnapshot(self, kernels, self.state.map_revision + 1)
+        self.state = dataclasses.replace(self.state, snapshot=snapshot, n_scans=n_scans)
 
     def integrate(self, scan: Scan, *, commit: Callable[[], None] | None = None) -> MapUpdate:
         self.mapping.pass_through()
@@ -247,8 +300,7 @@ class FakeMapper:
             weight_var=one,
         )
         whole = KernelSet.concatenate([self.snapshot.kernels, kernels])
-        self.snapshot = FakeSnapshot(self, whole, self.snapshot.map_revision + 1)
-        self.n_scans += 1
+        self._become(whole, self.n_scans + 1)
         return MapUpdate(
             map_revision=self.snapshot.map_revision,
             kernels=kernels,
@@ -268,8 +320,7 @@ class FakeMapper:
 
     def clear(self, *, commit: Any = None) -> TileChange:
         tiles = np.unique(np.floor(self.snapshot.kernels.hinge_mean / 10.0).astype(int), axis=0)
-        self.snapshot = FakeSnapshot(self, KernelSet.empty(), self.snapshot.map_revision + 1)
-        self.n_scans = 0
+        self._become(KernelSet.empty(), 0)
         return TileChange(10.0, [(int(x), int(y), int(z)) for x, y, z in tiles])
 
     def warm_up(self) -> None:
@@ -280,8 +331,8 @@ class Rig:
     """A server with fake mappers, and clients of it."""
 
     def __init__(self, settings: Settings) -> None:
-        self.mappers = {map_id: FakeMapper() for map_id in settings.maps}
-        self.server = MapServer(settings, listen="tcp/127.0.0.1:0", make_map=self._make_map)
+        self.mappers = {map_id: FakeMapper(map_id) for map_id in settings.maps}
+        self.server = MapServer(settings, listen="tcp/127.0.0.1:0", make_map=self._mapper_of)
         self._clients: list[Client] = []
 
     @property
@@ -301,9 +352,8 @@ class Rig:
             client.close()
         self.server.stop()
 
-    def _make_map(self, map_id: str) -> tuple[Any, Any]:
-        mapper: Any = self.mappers[map_id]
-        return mapper, QueryService(mapper, max_points=1000, max_grid_cells=100_000, max_coordinate_m=1e6)
+    def _mapper_of(self, map_id: str) -> Any:
+        return self.mappers[map_id]
 
 
 @pytest.fixture
@@ -333,7 +383,7 @@ def real_server() -> Iterator[MapServer]:
             "limits.max_cloud_points": 5000,
             "limits.max_query_bytes": 100_000,
             "limits.max_query_points": 2000,
-            "limits.max_grid_cells": 50_000,
+            "limits.max_grid_cells": 100_000,
             "limits.max_coordinate_m": 1e6,
         }
     )

@@ -11,8 +11,11 @@ from potclient import MapClient
 from potschemas import messages, wire
 from potschemas.keys import DEFAULT_ROOT
 from potschemas.messages import ErrorCode
-from potserver.asking.service import QueryService
+from potserver.asking.rays import Rays
+from potserver.asking.risk import Risk
+from potserver.domain.kernel_map import KernelMap
 from potserver.domain.types import Unknown
+from potserver.limits import Limits
 from potserver.server import MapServer
 
 from .conftest import Client, points_query
@@ -32,9 +35,8 @@ def map_client(real_client: Client, real_server: MapServer) -> Any:
         yield client
 
 
-def service(real_server: MapServer) -> QueryService:
-    mapper: Any = real_server.mapper("default")
-    return QueryService(mapper)
+def snapshot(real_server: MapServer) -> KernelMap:
+    return real_server.mapper("default").snapshot
 
 
 def array(values: Any, dtype: Any = np.float64) -> messages.Array:
@@ -54,14 +56,15 @@ def risk_query(**changes: Any) -> messages.RiskQuery:
 @pytest.mark.parametrize("unknown", ["occupied", "free", "prior"])
 def test_rays_are_what_the_map_says(map_client: MapClient, real_server: MapServer, unknown: str) -> None:
     answer = map_client.rays(np.zeros(3), DIRECTIONS, 9.0, quantiles=[0.25, 0.5], unknown=unknown)
-    plan = service(real_server).rays(
+    asked = Rays(
         np.zeros((40, 3)),
         DIRECTIONS.astype(np.float32),
         9.0,
         quantiles=[0.25, 0.5],
         unknown=Unknown(unknown),
     )
-    expected = plan.result(plan.part(i) for i in range(plan.n_parts))
+    plan = asked.plan(snapshot(real_server), Limits())
+    expected = plan.result(plan.parts())
     for name in ("hit_probability", "mean_m", "std_m", "quantile_m", "unknown_range_m", "unknown_share"):
         np.testing.assert_allclose(getattr(answer, name), getattr(expected, name), atol=1e-4)
     assert answer.revision == expected.map_revision
@@ -70,10 +73,9 @@ def test_rays_are_what_the_map_says(map_client: MapClient, real_server: MapServe
 
 def test_risk_is_what_the_map_says(map_client: MapClient, real_server: MapServer) -> None:
     answer = map_client.risk(PATH, SPHERES, resolution_m=0.2, unknown="prior", correlation_m=0.7)
-    plan = service(real_server).risk(
-        PATH, SPHERES, resolution_m=0.2, unknown=Unknown.PRIOR, correlation_m=0.7
-    )
-    expected = plan.result(plan.part(i) for i in range(plan.n_parts))
+    asked = Risk(PATH, SPHERES, resolution_m=0.2, unknown=Unknown.PRIOR, correlation_m=0.7)
+    plan = asked.plan(snapshot(real_server), Limits())
+    expected = plan.result(plan.parts())
     for name in ("max_probability", "union_probability", "unknown_share"):
         np.testing.assert_allclose(getattr(answer, name), getattr(expected, name), atol=1e-3)
     assert answer.path_union_probability == pytest.approx(expected.path_union_probability, abs=1e-3)

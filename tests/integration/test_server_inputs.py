@@ -254,11 +254,11 @@ def test_a_bad_query_gets_its_code(real_client: Client, name: str) -> None:
 
 
 def test_good_queries_still_work_after_all_that(real_client: Client) -> None:
-    parts = real_client.ask("grid", _grid(lower=[-7.0, -7, -2], upper=[7.0, 7, 3], resolution=0.5))
+    parts = real_client.ask("grid", _grid(lower=[-7.0, -7, -2], upper=[7.0, 7, 4], resolution=0.25))
     assert all(isinstance(part, messages.GridPart) for part in parts)
     assert sorted(part.part for part in parts) == list(range(parts[0].n_parts))
     assert parts[0].n_parts == 2
-    assert sum(part.occupancy.mean.shape[0] for part in parts) == 28 * 28 * 10
+    assert sum(part.occupancy.mean.shape[0] for part in parts) == 56 * 56 * 24
     kernels = [part.kernels.weight_mean.shape[0] for part in real_client.ask("params")]
     assert sum(kernels) == real_client.one("info").n_kernels > 0
     listed = real_client.one("atoms").atoms

@@ -17,8 +17,7 @@ from potserver.config import load_settings
 from potserver.errors import MapFileError, StorageError
 from potserver.server import MapServer
 
-from .conftest import Client, make_cloud, points_query
-from .test_server_flow import drain
+from .conftest import Client, drain, make_cloud, points_query
 
 Serve = Callable[..., tuple[MapServer, Client]]
 HERE = points_query([[5.9, 0.0, 0.0], [1.0, 0.0, 0.5]])

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from potserver.adapters import codec
+from potserver.codec.clouds import encode_cloud, read_cloud
 from potserver.domain.map_state import MapState
 from potserver.domain.types import MapUpdate, Scan, yaw_pose
 from potserver.errors import (
@@ -173,7 +173,7 @@ def _other_state(tile_size_m: float = SETTINGS.tile_size_m) -> MapState:
 @pytest.mark.parametrize("planar", [False, True])
 def test_a_kept_scan_is_the_same_scan(planar: bool) -> None:
     scan = make_scan(3, "r7", planar)
-    again = codec.read_cloud(codec.encode_cloud(scan))
+    again = read_cloud(encode_cloud(scan))
     assert (again.robot_id, again.seq, again.stamp_ns, again.is_planar) == ("r7", 3, scan.stamp_ns, planar)
     for name in ("points", "is_return", "T_map_sensor"):
         np.testing.assert_array_equal(getattr(scan, name), getattr(again, name))

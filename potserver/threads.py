@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable
 
-from potserver.adapters.log import get_logger
+from potserver.log import get_logger
 
 log = get_logger("potserver.threads")
 

@@ -1,4 +1,4 @@
-"""Kernels for `q/tiles`: short where they share something, and always the same numbers."""
+"""Kernels for the wire: as they are, and coded; coded ones are short where they share something, and the same numbers."""
 
 from __future__ import annotations
 
@@ -7,11 +7,14 @@ import pytest
 
 from potclient.kernels import KernelSet as ClientKernels
 from potclient.mirror import MapMirror
-from potschemas import messages
-from potserver.adapters.kernel_coding import code_kernels
+from potschemas import messages, wire
+from potschemas.answers import AnswerRule
+from potschemas.messages import DType
+from potserver.codec.kernels import code_kernels, encode_kernels
 from potserver.domain.types import KernelSet
 from tests.tiled_maps import GRID, asking, free_kernels, lattice_kernels, tiled_state
 
+RULE = AnswerRule(observed_activation=0.05, prior_var=50.0, residual_var=20.0, mean_moderation=0.25)
 SPACINGS = (GRID.coarse_m, GRID.fine_m)
 BOTH = KernelSet.concatenate([lattice_kernels(300, spacing_m=GRID.coarse_m), lattice_kernels(500, 1)])
 
@@ -107,3 +110,24 @@ def test_a_tile_at_utm_coordinates_loses_nothing() -> None:
     arrived = sent(BOTH, index)
     there = BOTH.hinge_mean.astype(np.float32).astype(np.float64) + np.array(index) * GRID.size_m
     np.testing.assert_array_equal(arrived.hinge_mean, there)
+
+
+def received_array(of: messages.Array) -> np.ndarray:
+    return wire.decode_array(of, "array", dtypes=tuple(DType), shape=(None,) * len(of.shape))
+
+
+@pytest.mark.parametrize("at", [0.0, 5.3e6])
+def test_kernels_travel_as_float32_about_a_float64_origin(at: float) -> None:
+    sent = free_kernels(50).moved(np.full(3, at))
+    received = encode_kernels(sent, RULE)
+    assert received.origin == np.round(sent.hinge_mean.mean(axis=0)).tolist()
+    hinges = np.asarray(received.origin) + received_array(received.hinge_mean)
+    np.testing.assert_allclose(hinges, sent.hinge_mean, atol=2e-6, rtol=0)
+    for name in ("hinge_var", "gamma_shape", "gamma_rate", "weight_mean", "weight_var"):
+        np.testing.assert_array_equal(received_array(getattr(received, name)), getattr(sent, name))
+
+
+def test_no_kernels_are_a_message_too() -> None:
+    received = encode_kernels(KernelSet.empty(), RULE)
+    assert received.origin == [0.0, 0.0, 0.0]
+    assert received.hinge_mean.shape == [0, 3]

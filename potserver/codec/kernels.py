@@ -1,4 +1,4 @@
-"""Kernels for `q/tiles`: what many of them share is said once, and only where the very same numbers come back."""
+"""Kernels for the wire: as they are, or coded. Coding states once what many kernels share, and loses no bit."""
 
 from __future__ import annotations
 
@@ -8,13 +8,30 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potschemas import messages
+from potschemas.answers import AnswerRule
 from potschemas.wire import pack_array
+from potserver.codec.base import float32
 from potserver.domain.types import Float32, Float64, KernelSet
 
 _BYTES_OF_SHAPE = 5 * 4  # hinge_var, gamma_shape, gamma_rate
 _BYTES_OF_LATTICE = 4 * 8
 _CELL_LIMIT = 2.0**31  # far beyond a tile; every float64 below is exact
 _LEAST_ON_LATTICE = 4  # kernels: of fewer, the hinges themselves are shorter than a lattice
+
+
+def encode_kernels(kernels: KernelSet, rule: AnswerRule) -> messages.Kernels:
+    """Kernels as they are: float64 hinges become float32 offsets from their centroid, in whole metres."""
+    origin = np.round(kernels.hinge_mean.mean(axis=0)) if len(kernels) else np.zeros(3)
+    return messages.Kernels(
+        origin=[float(c) for c in origin],
+        hinge_mean=float32(kernels.hinge_mean - origin),
+        hinge_var=float32(kernels.hinge_var),
+        gamma_shape=float32(kernels.gamma_shape),
+        gamma_rate=float32(kernels.gamma_rate),
+        weight_mean=float32(kernels.weight_mean),
+        weight_var=float32(kernels.weight_var),
+        **rule.fields(),
+    )
 
 
 def code_kernels(kernels: KernelSet, spacings_m: Sequence[float]) -> messages.CodedKernels:

@@ -1,0 +1,218 @@
+"""Declared queryables: how queries are taken, answered and refused, the same for all.
+
+A queryable is complete on its key expression, so that Zenoh asks one server and not all. Its thread only admits; workers
+or the map's writer answer. Replies take the quality of service of their query, so the asker sets the lane.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+import zenoh
+
+from potschemas import keys, messages
+from potserver.adapters.key_exprs import last_chunk
+from potserver.adapters.query_pool import QueryJob, QueryPool
+from potserver.adapters.questions.question import Asked, Question, Served
+from potserver.codec.base import Wire, check_encoding, check_size, decode, encode, encode_error
+from potserver.errors import DeadlineError, PotserverError, ShuttingDownError, UnsupportedError
+from potserver.log import get_logger
+
+log = get_logger("potserver.queries")
+
+INTEGRATE = "integrate"
+BUG = "a bug of the server; the traceback is in its log"
+_BACKLOG = 64  # queries between Zenoh and our admission; admission takes microseconds
+
+
+class Queryable:
+    """One declared key expression, and the thread's work that admits its queries.
+
+    Args:
+        session: Where it is declared.
+        key_expr: What it answers.
+        admit: Called with each query; must not block. What it raises is handed to `refuse`.
+        refuse: Ends a query with an error.
+        backlog: Queries between Zenoh and our admission.
+    """
+
+    def __init__(
+        self,
+        session: zenoh.Session,
+        key_expr: str,
+        *,
+        admit: Callable[[zenoh.Query], None],
+        refuse: Callable[[zenoh.Query, PotserverError], None],
+        backlog: int = 4,
+    ) -> None:
+        self._admit, self._refuse = admit, refuse
+        self._queryable = session.declare_queryable(
+            key_expr, zenoh.handlers.FifoChannel(backlog), complete=True
+        )
+
+    def run(self) -> None:
+        """Admit queries until undeclared, on a thread of our own."""
+        for query in self._queryable:
+            try:
+                self._admit(query)
+            except PotserverError as error:
+                self._refuse(query, error)
+            except Exception:
+                log.exception("query_admission_failed", key=str(query.key_expr))
+                self._refuse(query, PotserverError(BUG))
+
+    def undeclare(self) -> None:
+        """Take no more; ends `run`."""
+        self._queryable.undeclare()
+
+
+def check_query(query: zenoh.Query, kind: type[messages.Message], max_bytes: int, what: str) -> int:
+    """Refuse a query by its size and its encoding, before its bytes are touched; the size, bytes.
+
+    Raises:
+        TooLargeError, BadMessageError.
+    """
+    n_bytes = 0 if query.payload is None else len(query.payload)
+    check_size(n_bytes, max_bytes, what)
+    check_encoding(None if query.encoding is None else str(query.encoding), kind)
+    return n_bytes
+
+
+def payload_of(query: zenoh.Query) -> bytes:
+    """Its bytes; none are an empty payload."""
+    return b"" if query.payload is None else query.payload.to_bytes()
+
+
+def reply(query: zenoh.Query, key: str, wire: Wire) -> None:
+    """Send one reply, on our own key: the query's may be wild."""
+    query.reply(key, wire.payload, encoding=wire.encoding)
+
+
+def reply_error(query: zenoh.Query, error: PotserverError) -> None:
+    """Send what went wrong."""
+    wire = encode_error(error)
+    with contextlib.suppress(zenoh.ZError):  # the asker may be gone
+        query.reply_err(wire.payload, encoding=wire.encoding)
+
+
+class MapQueryable:
+    """All `q/<op>` of one map."""
+
+    def __init__(
+        self,
+        session: zenoh.Session,
+        map_keys: keys.MapKeys,
+        *,
+        questions: Sequence[Question[Any]],
+        integrate: Callable[[zenoh.Query], None],
+        served: Served,
+        pool: QueryPool,
+    ) -> None:
+        """Declare it.
+
+        Args:
+            session, map_keys: Where.
+            questions: Which kinds of questions there are.
+            integrate: Takes the clouds of `q/integrate`, which the map's writer answers.
+            served: What the questions are about.
+            pool: Whose workers answer.
+        """
+        self._keys, self._served, self._pool = map_keys, served, pool
+        self._questions, self._integrate = {question.op: question for question in questions}, integrate
+        self._ops = (INTEGRATE, *self._questions)
+        self._queryable = Queryable(
+            session, map_keys.query("*"), admit=self._admit, refuse=self._refuse, backlog=_BACKLOG
+        )
+
+    def run(self) -> None:
+        """Admit queries until undeclared, on a thread of our own."""
+        self._queryable.run()
+
+    def undeclare(self) -> None:
+        """Take no more; ends `run`."""
+        self._queryable.undeclare()
+
+    def _admit(self, query: zenoh.Query) -> None:
+        self._served.health.count("queries.received")
+        op = last_chunk(query.key_expr)
+        if op == INTEGRATE:
+            self._integrate(query)
+            return
+        question = self._questions.get(op)
+        if question is None:
+            raise UnsupportedError(f"no operation {op!r}; ask for one of {', '.join(self._ops)}")
+        n_bytes = check_query(query, question.query, self._served.limits.max_query_bytes, f"{op} query")
+        self._pool.submit(
+            QueryJob(
+                answer=lambda arrived_s: self._answer(query, question, arrived_s),
+                refuse=lambda error: self._refuse(query, error),
+                n_bytes=n_bytes,
+                is_short=question.is_short,
+            )
+        )
+
+    def _answer(self, query: zenoh.Query, question: Question[Any], arrived_s: float) -> None:
+        """On a worker thread."""
+        key, health = self._keys.query(question.op), self._served.health
+        try:
+            # hostile numbers may overflow; the checks see the infinity, the log needs no warning
+            with query, np.errstate(over="ignore"):  # `with query` ends the replies on every path
+                try:
+                    self._reply(query, question, key, arrived_s)
+                    health.count(f"queries.{question.op}.ok")
+                    health.observe(question.op, (time.monotonic() - arrived_s) * 1e3)
+                except PotserverError as error:  # expected: the asker gets a typed reply
+                    self._reply_error(query, error)
+                except Exception:  # a bug: the traceback stays here
+                    if self._pool.is_closing:  # the pool has cut the query off
+                        return
+                    log.exception("query_failed", key=key)
+                    self._reply_error(query, PotserverError(BUG))
+        except Exception:
+            log.exception("query_reply_failed", key=key)
+
+    def _reply(self, query: zenoh.Query, question: Question[Any], key: str, arrived_s: float) -> None:
+        """Decode, answer, and send the replies, as long as somebody waits for them."""
+        limits = self._served.limits
+        message = decode(payload_of(query), question.query, question.max_bytes or limits.max_query_bytes)
+        deadline_ms: float | None = getattr(message, "deadline_ms", None)
+
+        def check_may_go_on() -> None:
+            check_deadline(arrived_s, deadline_ms)
+            if self._pool.is_closing:
+                raise ShuttingDownError("the server is closing")
+
+        check_deadline(arrived_s, deadline_ms)
+        asked = Asked(self._served, self._served.mapper.state, check_may_go_on)
+        for part in question.answer(asked, message):
+            reply(query, key, encode(part))
+
+    def _refuse(self, query: zenoh.Query, error: PotserverError) -> None:
+        with query:
+            self._reply_error(query, error)
+
+    def _reply_error(self, query: zenoh.Query, error: PotserverError) -> None:
+        chunk = last_chunk(query.key_expr)
+        op = chunk if chunk in self._ops else "unknown"
+        self._served.health.count(f"queries.{op}.{error.code}")
+        log.debug(
+            "query_refused", map_id=self._keys.map_id, op=op, reason=error.code, detail=str(error)[:300]
+        )
+        reply_error(query, error)
+
+
+def check_deadline(arrived_s: float, deadline_ms: float | None) -> None:
+    """Refuse to work for an asker that waits no longer.
+
+    Args:
+        arrived_s: When the query came, of `time.monotonic`.
+        deadline_ms: How long its asker waits; None = for ever.
+    Raises:
+        DeadlineError: it does not.
+    """
+    if deadline_ms is not None and (waited_ms := (time.monotonic() - arrived_s) * 1e3) > deadline_ms:
+        raise DeadlineError(f"{waited_ms:.1f} ms since the query came, its deadline was {deadline_ms:.1f} ms")

@@ -1,0 +1,185 @@
+"""`ctl/<verb>` of one map. Each follows every cloud that was admitted before it."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+import zenoh
+
+from potschemas import keys, messages
+from potserver.adapters.intake import Barrier, IntakeQueue
+from potserver.adapters.key_exprs import is_wild, last_chunk
+from potserver.adapters.outbox import Outbox
+from potserver.adapters.queryable import BUG, Queryable, check_query, payload_of, reply, reply_error
+from potserver.adapters.questions.question import Served
+from potserver.adapters.writer import MapWriter
+from potserver.codec.base import decode, encode
+from potserver.codec.clouds import decode_transform
+from potserver.errors import BadMessageError, DeadlineError, PotserverError, UnsupportedError
+from potserver.log import get_logger
+
+log = get_logger("potserver.queries")
+
+DRAIN = "drain"
+_FIELDS = ("name", "robot", "T_map_saved")  # of a request, that some verbs take
+Work = Callable[[], str]  # runs on the writer's thread; returns what was done, for people
+
+
+class Verb(NamedTuple):
+    """What one verb takes and does."""
+
+    work: Callable[[MapWriter, messages.ControlRequest], Work]
+    needs: dict[str, str] = {}  # noqa: RUF012 - a field, and what the refusal calls it; never changed
+    takes: tuple[str, ...] = ()  # fields that may be left out
+
+
+def _save(writer: MapWriter, request: messages.ControlRequest) -> Work:
+    name = None if request.name is messages.ABSENT else request.name
+    return lambda: writer.save(name)
+
+
+def _load(writer: MapWriter, request: messages.ControlRequest) -> Work:
+    return lambda: writer.load(str(request.name))
+
+
+def _merge(writer: MapWriter, request: messages.ControlRequest) -> Work:
+    pose = np.eye(4)
+    if request.T_map_saved is not messages.ABSENT:
+        pose = decode_transform(request.T_map_saved, "T_map_saved")
+    return lambda: writer.merge(str(request.name), pose)
+
+
+def _forget(writer: MapWriter, request: messages.ControlRequest) -> Work:
+    return lambda: writer.forget(str(request.robot))
+
+
+def _clear(writer: MapWriter, _request: messages.ControlRequest) -> Work:
+    return writer.clear
+
+
+def _drain(_writer: MapWriter, _request: messages.ControlRequest) -> Work:
+    return lambda: "all clouds are in the map; only a restart of the server takes clouds again"
+
+
+_A_NAME = {"name": "the name of a saved map"}
+VERBS = {
+    "save": Verb(_save, takes=("name",)),
+    "load": Verb(_load, needs=_A_NAME),
+    "clear": Verb(_clear),
+    DRAIN: Verb(_drain),
+    "merge": Verb(_merge, needs=_A_NAME, takes=("T_map_saved",)),
+    "forget": Verb(_forget, needs={"robot": "a robot; to forget everything, clear"}),
+}
+
+
+def work_of(verb: str, request: messages.ControlRequest, writer: MapWriter) -> Work:
+    """What the writer's thread shall do.
+
+    Raises:
+        BadMessageError: a field is missing, or is none of the verb's. ShapeError, BadPoseError: of the transform.
+    """
+    needs, takes = VERBS[verb].needs, VERBS[verb].takes
+    for field in _FIELDS:
+        if getattr(request, field) is not messages.ABSENT and field not in needs and field not in takes:
+            raise BadMessageError(f"{verb} takes no {field}")
+    for field, what in needs.items():
+        if getattr(request, field) is messages.ABSENT:
+            raise BadMessageError(f"{verb} needs {what}")
+    return VERBS[verb].work(writer, request)
+
+
+class ControlQueryable:
+    """All `ctl/<verb>` of one map."""
+
+    def __init__(
+        self,
+        session: zenoh.Session,
+        map_keys: keys.MapKeys,
+        *,
+        served: Served,
+        intake: IntakeQueue,
+        writer: MapWriter,
+        withdraw: Callable[[], None],
+        prompt: Outbox,
+    ) -> None:
+        """Declare it.
+
+        Args:
+            session, map_keys: Where.
+            served: The map.
+            intake: Where the work waits for the clouds before it.
+            writer: Whose thread does it.
+            withdraw: Says that the map takes no more clouds.
+            prompt: Sends the replies.
+        """
+        self._keys, self._served, self._intake, self._writer = map_keys, served, intake, writer
+        self._withdraw, self._prompt = withdraw, prompt
+        self._queryable = Queryable(session, map_keys.control("*"), admit=self._admit, refuse=self._refuse)
+
+    def run(self) -> None:
+        """Admit requests until undeclared, on a thread of our own."""
+        self._queryable.run()
+
+    def undeclare(self) -> None:
+        """Take no more; ends `run`."""
+        self._queryable.undeclare()
+
+    def _admit(self, query: zenoh.Query) -> None:
+        verb = last_chunk(query.key_expr)
+        if is_wild(query.key_expr):
+            raise UnsupportedError(
+                "control changes a map: name the map and the verb, wildcards are not taken"
+            )
+        if verb not in VERBS:
+            raise UnsupportedError(f"no verb {verb!r}; there are {', '.join(VERBS)}")
+        check_query(query, messages.ControlRequest, self._served.limits.max_query_bytes, "control request")
+        request = decode(payload_of(query), messages.ControlRequest)
+        deadline_s = None if request.timeout_s is None else time.monotonic() + request.timeout_s
+        work = work_of(verb, request, self._writer)
+
+        def run() -> None:
+            try:
+                if deadline_s is not None and time.monotonic() > deadline_s:
+                    raise DeadlineError(
+                        f"{verb}: {request.timeout_s} s passed before the clouds ahead of it were mapped"
+                    )
+                self._done(query, verb, work())
+            except PotserverError as error:
+                self._refuse(query, error)
+            except Exception:
+                log.exception("control_failed", key=self._keys.control(verb))
+                self._refuse(query, PotserverError(BUG))
+
+        self._intake.admit_barrier(
+            Barrier(run, lambda error: self._refuse(query, error)), is_last=verb == DRAIN
+        )
+        if verb == DRAIN:
+            self._withdraw()
+            log.info("map_draining", map_id=self._keys.map_id)
+
+    def _done(self, query: zenoh.Query, verb: str, message: str) -> None:
+        answer = encode(
+            messages.ControlReply(
+                verb=verb, map_revision=self._served.mapper.state.map_revision, message=message
+            )
+        )
+        self._served.health.count(f"control.{verb}.ok")
+
+        def send() -> None:
+            with query:
+                reply(query, self._keys.control(verb), answer)
+
+        self._prompt.post_now(send)
+
+    def _refuse(self, query: zenoh.Query, error: PotserverError) -> None:
+        verb = last_chunk(query.key_expr)
+        self._served.health.count(f"control.{verb if verb in VERBS else 'unknown'}.{error.code}")
+
+        def send() -> None:
+            with query:
+                reply_error(query, error)
+
+        self._prompt.post_now(send)

@@ -1,0 +1,33 @@
+"""`q/grid`: occupancy at the cell centres of a box, in parts."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from potschemas import messages
+from potserver.adapters.questions.question import Asked, Question
+from potserver.asking.grid import Grid, GridPlan, GridRun
+from potserver.codec.base import MAX_SMALL_BYTES
+from potserver.codec.occupancy import encode_occupancy
+
+
+def _answer(asked: Asked, query: messages.GridQuery) -> Iterator[messages.Message]:
+    plan = Grid(query.lower, query.upper, query.resolution).plan(asked.snapshot, asked.limits)
+    for number, run in enumerate(asked.parts(plan)):
+        yield encode_part(plan, number, run)
+
+
+def encode_part(plan: GridPlan, number: int, run: GridRun) -> messages.GridPart:
+    """One part of the reply."""
+    return messages.GridPart(
+        part=number,
+        n_parts=plan.n_parts,
+        shape=list(plan.shape),
+        first_cell=run.first_cell,
+        lower=plan.lower.tolist(),
+        resolution=plan.resolution,
+        occupancy=encode_occupancy(run.occupancy),
+    )
+
+
+QUESTION = Question(op="grid", query=messages.GridQuery, answer=_answer, max_bytes=MAX_SMALL_BYTES)

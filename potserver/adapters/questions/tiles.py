@@ -1,0 +1,67 @@
+"""`q/tiles`: what of the map's tiles differs from what the asker has, in parts."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from potschemas import messages, wire
+from potschemas.messages import DType
+from potserver.adapters.questions.question import Asked, Question
+from potserver.asking.tiles import MANTISSA_BITS, KnownTiles, TileRun, Tiles, TilesPlan
+from potserver.codec.base import typed_errors
+from potserver.codec.kernels import code_kernels
+from potserver.errors import BadMessageError
+from potserver.limits import Limits
+
+
+def decode_tiles(query: messages.TilesQuery) -> Tiles:
+    """What is asked.
+
+    Raises:
+        BadMessageError: tiles are known, and their epoch is not said.
+        ShapeError, TooLargeError: of the known tiles.
+    """
+    known = None
+    if query.known is not None:
+        if query.epoch is None:
+            raise BadMessageError("pot.tiles_query.v1: `known` needs the `epoch` that its revisions are of")
+        with typed_errors():
+            columns = wire.unpack_array(
+                query.known,
+                "known",
+                dtypes=(DType.INT64,),
+                shape=(4, None),
+                max_elements=4 * Limits.max_query_tiles,
+            )
+        known = KnownTiles(query.epoch, columns[:3].T, columns[3])
+    bits = MANTISSA_BITS if query.mantissa_bits is None else query.mantissa_bits
+    return Tiles(known, query.lower, query.upper, bits)
+
+
+def encode_part(plan: TilesPlan, number: int, run: TileRun) -> messages.TilesPart:
+    """One part of the reply; the tiles that are gone travel in part 0."""
+    return messages.TilesPart(
+        part=number,
+        n_parts=plan.n_parts,
+        epoch=plan.epoch,
+        map_revision=plan.map_revision,
+        whole=plan.is_whole,
+        tile_size_m=float(plan.tile_size_m),
+        tiles=wire.pack_array(np.vstack([run.indices.T, run.revisions])),
+        counts=wire.pack_array(run.counts),
+        gone=wire.pack_array(plan.gone.T) if number == 0 and len(plan.gone) else None,
+        kernels=code_kernels(run.kernels, plan.spacings_m),
+        **plan.rule.fields(),
+    )
+
+
+def _answer(asked: Asked, query: messages.TilesQuery) -> Iterator[messages.Message]:
+    size_m = asked.served.mapper.settings.tile_size_m
+    plan = decode_tiles(query).plan(asked.state, asked.limits, tile_size_m=size_m)
+    for number, run in enumerate(asked.parts(plan)):
+        yield encode_part(plan, number, run)
+
+
+QUESTION = Question(op="tiles", query=messages.TilesQuery, answer=_answer)

@@ -1,0 +1,128 @@
+"""`srv/<server>/stats`: the server's counters, once a second and when asked."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Mapping
+
+import zenoh
+
+from potschemas import messages
+from potserver.adapters.queryable import Queryable, check_query, payload_of, reply, reply_error
+from potserver.codec.base import Wire, decode, encode
+from potserver.domain.map_state import MapState
+from potserver.errors import PotserverError
+from potserver.health import Health, rss_bytes
+from potserver.limits import Limits
+from potserver.log import get_logger
+from potserver.threads import spawn
+
+log = get_logger("potserver.stats")
+
+PERIOD_S = 1.0  # between two publications; the contract says so
+
+
+class StatsPublisher:
+    """Publishes the counters of a server, and answers who asks for them."""
+
+    def __init__(
+        self, session: zenoh.Session, key: str, encode_now: Callable[[], Wire], limits: Limits
+    ) -> None:
+        self._key, self._encode_now, self._limits = key, encode_now, limits
+        self._stop = threading.Event()
+        # background: the first to go when a link is full
+        self._publisher = session.declare_publisher(
+            key, priority=zenoh.Priority.BACKGROUND, congestion_control=zenoh.CongestionControl.DROP
+        )
+        self._queryable = Queryable(session, key, admit=self._answer, refuse=_refuse)
+        self._threads = [
+            spawn("stats-publisher", self._publish),
+            spawn("stats-queryable", self._queryable.run),
+        ]
+
+    def close(self) -> None:
+        """Publish and answer no more."""
+        self._stop.set()
+        self._queryable.undeclare()
+        for thread in self._threads:
+            thread.join(1.0)
+        self._publisher.undeclare()
+
+    def _publish(self) -> None:
+        next_s = time.monotonic()
+        while not self._stop.wait(max(0.0, next_s - time.monotonic())):
+            next_s = max(next_s + PERIOD_S, time.monotonic())
+            try:
+                wire = self._encode_now()
+                self._publisher.put(wire.payload, encoding=wire.encoding)
+            except Exception:
+                log.exception("stats_failed")
+
+    def _answer(self, query: zenoh.Query) -> None:
+        check_query(query, messages.StatsQuery, self._limits.max_query_bytes, "stats query")
+        decode(payload_of(query), messages.StatsQuery)
+        wire = self._encode_now()
+        with query:
+            reply(query, self._key, wire)
+
+
+def _refuse(query: zenoh.Query, error: PotserverError) -> None:
+    with query:
+        reply_error(query, error)
+
+
+def encode_stats(
+    health: Health,
+    *,
+    server_id: str,
+    state: str,
+    n_robots: int,
+    queues: dict[str, int],
+    maps: Mapping[str, MapState],
+) -> Wire:
+    """The counters now.
+
+    Args:
+        health: Of the server.
+        server_id: Its id.
+        state: serving or draining.
+        n_robots: With a token, of all maps.
+        queues: What waits, by the queue's name.
+        maps: One state of each.
+    """
+    return encode(
+        messages.Stats(
+            server=server_id,
+            stamp_ns=time.time_ns(),
+            uptime_s=health.uptime_s,
+            state=state,
+            counters=health.counters() | {"robots.alive": n_robots},
+            queues=queues,
+            latencies={
+                kind: messages.LatencySummary(
+                    count=summary.n,
+                    p50_ms=summary.p50_ms,
+                    p95_ms=summary.p95_ms,
+                    p99_ms=summary.p99_ms,
+                    max_ms=summary.max_ms,
+                )
+                for kind, summary in health.latencies().items()
+            },
+            rss_bytes=rss_bytes(),
+            map_kernels={map_id: len(held.snapshot) for map_id, held in maps.items()},
+            map_scores={map_id: _scores(held) for map_id, held in maps.items()},
+        )
+    )
+
+
+def _scores(held: MapState) -> messages.MapScores:
+    """How well a map answers, with the moderation that it answers with."""
+    scores, moderation = held.scores, held.snapshot.rule.mean_moderation
+    return messages.MapScores(
+        n_points=scores.n_points,
+        nll=scores.mean_nll(moderation),
+        brier=scores.mean_brier,
+        ece=scores.ece,
+        mean_moderation=moderation,
+    )

@@ -1,0 +1,55 @@
+"""Occupancy at any points."""
+
+from __future__ import annotations
+
+import dataclasses
+
+from numpy.typing import ArrayLike
+
+from potserver.asking.plan import Plan, checked_points
+from potserver.domain.kernel_map import KernelMap
+from potserver.domain.types import Float64, Occupancy
+from potserver.errors import TooLargeError
+from potserver.limits import Limits
+
+
+@dataclasses.dataclass(frozen=True, slots=True, eq=False)
+class Points:
+    """What is asked."""
+
+    points: ArrayLike  # (N, 3) or (N, 2) m, map frame
+    with_gradient: bool = False  # answer the gradients of the mean and of the latent mean too
+
+    def plan(self, snapshot: KernelMap, limits: Limits) -> PointsPlan:
+        """Check the question.
+
+        Raises:
+            ShapeError, BadPointsError, OutOfRangeError: of the points.
+            TooLargeError: too many points.
+        """
+        points = checked_points(self.points, limits)
+        if len(points) > limits.max_query_points:
+            raise TooLargeError(f"{len(points)} points in one query, the limit is {limits.max_query_points}")
+        return PointsPlan(snapshot, points, self.with_gradient, part_size=limits.max_query_points)
+
+
+@dataclasses.dataclass(frozen=True, slots=True, eq=False)
+class PointsPlan(Plan[Occupancy]):
+    """Points that passed their checks; they are answered in one part."""
+
+    snapshot: KernelMap
+    points: Float64  # (N, 3) m, map frame
+    with_gradient: bool
+    part_size: int
+
+    @property
+    def n_items(self) -> int:
+        """Points."""
+        return len(self.points)
+
+    def part(self, i: int) -> Occupancy:
+        """The answers at some of the points, in the order asked."""
+        points = self.points[self.items(i)]
+        if self.with_gradient:
+            return self.snapshot.occupancy_with_gradient(points)
+        return self.snapshot.occupancy(points)

@@ -1,0 +1,1 @@
+"""Bytes of the wire to domain objects and back: what adapters, storage and commands share."""

@@ -1,0 +1,200 @@
+"""MapNode: everything of one map that a server runs. Its queues, its writer, and what is declared for it."""
+
+from __future__ import annotations
+
+import collections
+import contextlib
+import time
+from collections.abc import Mapping
+from typing import NamedTuple, Protocol
+
+import zenoh
+
+from potschemas import keys
+from potserver.adapters.clouds import CloudDoor, CloudReader, CloudSubscriber
+from potserver.adapters.intake import IntakeQueue
+from potserver.adapters.outbox import Outbox
+from potserver.adapters.poses import WAIT_S, PoseBuffer, PoseSubscriber
+from potserver.adapters.presence import RobotWatch, ServerToken
+from potserver.adapters.query_pool import QueryPool
+from potserver.adapters.queryable import MapQueryable
+from potserver.adapters.questions.control import ControlQueryable
+from potserver.adapters.questions.question import Served
+from potserver.adapters.questions.registry import QUESTIONS
+from potserver.adapters.receipts import ReceiptSender
+from potserver.adapters.stamps import StampOrder
+from potserver.adapters.writer import Keeper, MapWriter
+from potserver.atoms.store import AtomStore
+from potserver.config import Settings
+from potserver.errors import ShuttingDownError
+from potserver.health import Health
+from potserver.log import get_logger
+from potserver.mapping.service import MappingService
+from potserver.threads import spawn
+
+log = get_logger("potserver.server")
+
+FLUSH_S = 3.0  # for what waits in the outboxes, after the drain
+QUEUE_MESSAGES = 8  # of the largest size: so many bytes may wait in one queue
+_PROMPT_TASKS = 4096  # receipts and ticks: small, and never dropped
+_BULK_TASKS = 64  # parameters: large, and dropped beyond this
+
+
+class _Declaration(Protocol):
+    def run(self) -> None: ...
+    def undeclare(self) -> None: ...
+
+
+class Shared(NamedTuple):
+    """What all maps of a server share."""
+
+    settings: Settings
+    session: zenoh.Session
+    pool: QueryPool
+    atoms: AtomStore
+    health: Health
+
+
+class MapNode:
+    """One map of a server.
+
+    Threads: a writer (the only one that changes the map), two outboxes, and one reader for each of clouds, poses, queries,
+    control and robots' tokens.
+    """
+
+    def __init__(
+        self, mapper: MappingService, keeper: Keeper, newest_stamps: Mapping[str, int], shared: Shared
+    ) -> None:
+        """Declare everything, and begin to work.
+
+        Args:
+            mapper: Of the map.
+            keeper: Where the map survives.
+            newest_stamps: Of its robots, ns, from before.
+            shared: With the other maps of the server.
+        """
+        settings, limits = shared.settings, shared.settings.limits
+        self.map_id, self.mapper = mapper.map_id, mapper
+        self._session = shared.session
+        self._keys = keys.MapKeys(settings.root, self.map_id)
+        self._tokens: collections.deque[ServerToken] = collections.deque()
+        queued_bytes = QUEUE_MESSAGES * limits.max_cloud_bytes
+        self.intake = IntakeQueue(max_queued=settings.intake.max_queued, max_queued_bytes=queued_bytes)
+        self.prompt = Outbox(
+            f"{self.map_id}-prompt", max_pending=_PROMPT_TASKS, max_pending_bytes=queued_bytes
+        )
+        self.bulk = Outbox(f"{self.map_id}-bulk", max_pending=_BULK_TASKS, max_pending_bytes=queued_bytes)
+        self._receipts = ReceiptSender(
+            self._session,
+            self._keys,
+            mapper=mapper,
+            intake=self.intake,
+            health=shared.health,
+            limits=limits,
+            prompt=self.prompt,
+            bulk=self.bulk,
+        )
+        self.robots = RobotWatch(
+            self._session, self._keys, health=shared.health, max_robots=limits.max_robots
+        )
+        self._declarations = [self.robots, *self._declare(keeper, newest_stamps, shared)]
+        self._threads = [
+            spawn(f"{self.map_id}-writer", self._writer.run),
+            *(spawn(f"{self.map_id}-{type(d).__name__}", d.run) for d in self._declarations),
+        ]
+
+    def _declare(
+        self, keeper: Keeper, newest_stamps: Mapping[str, int], shared: Shared
+    ) -> list[_Declaration]:
+        """The way in, for clouds and poses, and the questions."""
+        settings, limits, health = shared.settings, shared.settings.limits, shared.health
+        session, map_keys, allowed = self._session, self._keys, frozenset(settings.intake.robots)
+        max_future_s = settings.intake.max_future_s
+        poses = PoseBuffer(
+            max_gap_s=settings.poses.max_gap_s,
+            max_future_s=max_future_s,
+            max_robots=limits.max_robots,
+            wait_s=WAIT_S,
+        )
+        door = CloudDoor(self.intake, self._receipts, health, limits, allowed)
+        self._writer = MapWriter(
+            self.mapper,
+            keeper,
+            stamps=StampOrder(
+                newest_stamps,
+                allow_old=settings.intake.allow_old_stamps,
+                max_future_s=max_future_s,
+                max_robots=limits.max_robots,
+            ),
+            intake=self.intake,
+            reader=CloudReader(limits, poses, allowed),
+            receipts=self._receipts,
+            health=health,
+        )
+        served = Served(
+            server_id=settings.server_id,
+            map_id=self.map_id,
+            maps=settings.maps,
+            mapper=self.mapper,
+            atoms=shared.atoms,
+            health=health,
+            limits=limits,
+            durable=keeper.durable,
+        )
+        return [
+            PoseSubscriber(session, map_keys, poses=poses, health=health, allowed_robots=allowed),
+            CloudSubscriber(session, map_keys, door),
+            MapQueryable(
+                session,
+                map_keys,
+                questions=QUESTIONS,
+                integrate=door.admit_query,
+                served=served,
+                pool=shared.pool,
+            ),
+            ControlQueryable(
+                session,
+                map_keys,
+                served=served,
+                intake=self.intake,
+                writer=self._writer,
+                withdraw=self.withdraw,
+                prompt=self.prompt,
+            ),
+        ]
+
+    def announce(self, server_id: str) -> None:
+        """Say that the map is served."""
+        self._tokens.append(ServerToken(self._session, self._keys, server_id))
+
+    def withdraw(self) -> None:
+        """Say that it is not, and take no more clouds; from any thread, any number of times."""
+        self.intake.stop_admitting()
+        with contextlib.suppress(IndexError):
+            while True:
+                self._tokens.pop().undeclare()
+
+    def drain(self, deadline: float) -> bool:
+        """Map the clouds that wait; refuse those left at the deadline. False if any were left."""
+        idle = self.intake.wait_idle(max(0.0, deadline - time.monotonic()))
+        clouds, barriers = self.intake.close()
+        closing = ShuttingDownError("the server is closing")
+        for job in clouds:
+            self._receipts.refuse(job, closing)
+        for barrier in barriers:
+            barrier.refuse(closing)
+        return idle and not clouds and not barriers
+
+    def close(self) -> bool:
+        """Undeclare, send what waits, end the threads. False if something did not end in time."""
+        deadline = time.monotonic() + FLUSH_S
+        for declaration in self._declarations:
+            declaration.undeclare()
+        for thread in self._threads:
+            thread.join(max(0.0, deadline - time.monotonic()))
+        # an outbox flushes last: the threads above were filling it
+        flushed = [outbox.close(FLUSH_S) for outbox in (self.prompt, self.bulk)]
+        alive = [thread.name for thread in self._threads if thread.is_alive()]
+        if alive:
+            log.warning("threads_left_behind", threads=alive)
+        return all(flushed) and not alive

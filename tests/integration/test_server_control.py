@@ -1,0 +1,112 @@
+"""Control verbs over real sessions: in order with the clouds; the mapper is one that tests can hold."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from potschemas import messages
+from potschemas.messages import ErrorCode, ReceiptStatus
+from potserver.adapters.intake import Barrier
+
+from .conftest import (
+    DEADLINE_S,
+    drain,
+    in_background,
+    make_cloud,
+    points_query,
+    until,
+)
+
+HERE = points_query([[0.0, 0, 0]])
+MakeRig = Callable[..., Any]
+
+
+def test_clear_comes_after_the_clouds_before_it_and_forgets_the_stamps(make_rig: MakeRig) -> None:
+    rig = make_rig()
+    client = rig.client()
+    receipts = client.receipts("r1")
+    rig.mapper.mapping.hold()
+    for seq in (1, 2):
+        client.put_cloud(make_cloud(seq=seq))
+    until(lambda: client.stats().queues["clouds.depth"] == 1, "one in work, one waiting")
+    cleared = in_background(lambda: client.control("clear"))
+    until(lambda: rig.server.nodes["default"].intake.n_barriers, "the barrier")
+    client.put_cloud(make_cloud(seq=1))  # an old stamp, but the map will be empty by then
+    until(lambda: client.stats().queues["clouds.depth"] == 2, "both waiting")
+    rig.mapper.mapping.release()
+    reply = cleared()
+    assert (reply.verb, reply.map_revision) == ("clear", 3)
+    assert [(r.seq, r.status, r.map_revision) for r in drain(receipts, 3)] == [
+        (1, ReceiptStatus.ACCEPTED, 1),
+        (2, ReceiptStatus.ACCEPTED, 2),
+        (1, ReceiptStatus.ACCEPTED, 4),
+    ]
+    assert client.one("info").n_scans == 1
+
+
+def test_clear_tells_the_planners_which_tiles_are_gone(make_rig: MakeRig) -> None:
+    rig = make_rig()
+    client = rig.client()
+    ticks = client.listen(client.keys.revision)
+    client.one("integrate", make_cloud(robot="r1"))
+    hinges = rig.mapper.snapshot.kernels.hinge_mean
+    former = {tuple(tile) for tile in np.floor(hinges / rig.mapper.settings.tile_size_m).astype(int).tolist()}
+    client.control("clear")
+    _, tick = drain(ticks, 2)
+    assert (tick.map_revision, tick.n_kernels, tick.tile_size_m) == (2, 0, 10.0)
+    assert {tuple(tile) for tile in tick.changed_tiles} == former
+    assert len(tick.changed_tiles) == len(former) > 1
+
+
+def test_a_control_request_may_give_up_waiting(make_rig: MakeRig) -> None:
+    rig = make_rig()
+    client = rig.client()
+    rig.mapper.mapping.hold()
+    client.put_cloud(make_cloud())
+    rig.mapper.mapping.wait_entered()
+    cleared = in_background(lambda: client.control("clear", messages.ControlRequest(timeout_s=1e-6)))
+    until(lambda: rig.server.nodes["default"].intake.n_barriers, "the barrier")
+    rig.mapper.mapping.release()
+    assert cleared().code is ErrorCode.DEADLINE
+    assert client.one("info").n_scans == 1, "nothing was cleared"
+
+
+def test_drain_maps_what_waits_and_takes_no_more(make_rig: MakeRig) -> None:
+    rig = make_rig()
+    client = rig.client()
+    receipts = client.receipts("r1")
+    rig.mapper.mapping.hold()
+    for seq in (1, 2):
+        client.put_cloud(make_cloud(seq=seq))
+    until(lambda: client.stats().queues["clouds.depth"] == 1, "one in work, one waiting")
+    drained = in_background(lambda: client.control("drain"))
+    until(lambda: client.stats().state == "draining", "the state")
+    until(lambda: client.alive(client.keys.server_token("potserver")) == [], "the token to go")
+    client.put_cloud(make_cloud(seq=3))
+    late = receipts.get(timeout=DEADLINE_S)
+    assert (late.seq, late.status, late.reason) == (3, ReceiptStatus.DROPPED, "shutting_down")
+    assert client.error("integrate", make_cloud(seq=4, robot="r1")).code is ErrorCode.SHUTTING_DOWN
+    rig.mapper.mapping.release()
+    reply = drained()
+    assert reply.map_revision == 2
+    assert "restart" in reply.message
+    assert [r.seq for r in drain(receipts, 2)] == [1, 2]
+    assert client.one("points", HERE).map_revision == 2, "questions are still answered"
+
+
+def test_a_drain_that_could_not_be_queued_has_not_drained(make_rig: MakeRig) -> None:
+    rig = make_rig()
+    client = rig.client()
+    rig.mapper.mapping.hold()
+    client.put_cloud(make_cloud())
+    rig.mapper.mapping.wait_entered()
+    intake = rig.server.nodes["default"].intake
+    for _ in range(16):
+        intake.admit_barrier(Barrier(lambda: None, lambda _: None))
+    assert client.control("drain").code is ErrorCode.OVERLOADED
+    rig.mapper.mapping.release()
+    assert client.one("integrate", make_cloud(seq=1, robot="r1")).map_revision == 2
+    assert client.alive(client.keys.server_token("potserver"))
