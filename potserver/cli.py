@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, TextIO
 
 import zenoh
 
-from potclient import cli as client_cli
+from potclient.commands import export_flags, pose_flag
 from potclient.datasets import FORMATS, FRAMES
 from potschemas import __version__
 from potserver import bundled
@@ -518,8 +518,8 @@ def _add_map_commands(commands: Any) -> None:
         formatter_class=_Formatter,
     )
     export.add_argument("path", type=Path, metavar="FILE", help="a *.map file, or a map's folder in a store")
-    export.add_argument("-f", "--format", dest="kind", choices=client_cli.EXPORT_KINDS, required=True)
-    client_cli.add_export_flags(export)
+    export.add_argument("-f", "--format", dest="kind", choices=export_flags.EXPORT_KINDS, required=True)
+    export_flags.add_export_flags(export)
     export.set_defaults(map_command="export", settings_flags=False)
 
     import_ = commands.add_parser(
@@ -555,7 +555,7 @@ def _add_map_commands(commands: Any) -> None:
     merge.add_argument(
         "-o", "--out", type=Path, required=True, metavar="FILE", help="the *.map file to write"
     )
-    client_cli.add_pose_flag(merge)
+    pose_flag.add_pose_flag(merge)
     _add_settings_flags(merge)
     merge.set_defaults(map_command="merge", settings_flags=True)
 

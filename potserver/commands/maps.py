@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from potclient import UsageError, results
-from potclient import cli as client_cli
+from potclient.commands import export_flags, pose_flag
 from potclient.kernels import KernelSet as ClientKernels
 from potclient.octomap import DEPTH, KEY_ORIGIN, Leaves, read_bt
 from potschemas import messages, wire
@@ -206,8 +206,8 @@ class UnservedMap:
 
 
 def _export(options: argparse.Namespace, _settings: Settings, _say: Say) -> int:
-    client_cli.check_export_flags(options)
-    return client_cli.export_map(UnservedMap(read_map(_one_file(options.path))), options)
+    export_flags.check_export_flags(options)
+    return export_flags.export_map(UnservedMap(read_map(_one_file(options.path))), options)
 
 
 # --- import -----------------------------------------------------------------------------------------------------------
@@ -343,7 +343,7 @@ def _merge(options: argparse.Namespace, settings: Settings, say: Say) -> int:
     service = MappingService(AtomDictionary(()), mapping, threads=settings.threads)
     service.restore(ours.state())
     say(f"merging {theirs.record.n_scans} scans into {ours.record.n_scans}: some seconds for a street")
-    change = service.merge(theirs.state(), client_cli.pose_of(*options.pose) if options.pose else np.eye(4))
+    change = service.merge(theirs.state(), pose_flag.pose_of(*options.pose) if options.pose else np.eye(4))
     stamps = dict(ours.record.stamps)
     for robot_id, stamp_ns in theirs.record.stamps.items():
         stamps[robot_id] = max(stamp_ns, stamps.get(robot_id, 0))

@@ -17,7 +17,7 @@ import zenoh
 
 from potclient import feed
 from potclient.atoms import Atom
-from potclient.client import CONTROL_TIMEOUT_S, MapClient, _query_qos
+from potclient.client import MapClient
 from potclient.datasets import open_dataset
 from potclient.errors import (
     AtomRefusedError,
@@ -35,10 +35,13 @@ from potclient.errors import (
     UsageError,
     error_from_reply,
 )
+from potclient.feed import FeedOptions
 from potclient.holdout import HoldOut
 from potclient.kernels import KernelSet
+from potclient.link import _query_qos
 from potclient.loadtest import LoadSettings, run_load
-from potclient.play import play
+from potclient.play import Sending, play
+from potclient.questions.control import CONTROL_TIMEOUT_S
 from potclient.results import Receipt
 from potclient.session import SessionOptions
 from potschemas import messages
@@ -152,7 +155,7 @@ def test_publishing_never_blocks_and_the_newest_cloud_wins(server: FakeServer, c
 
 def test_a_lost_receipt_does_not_stall_the_feed(server: FakeServer) -> None:
     server.script.receipts = lambda cloud: None if cloud.seq <= 2 else ReceiptStatus.ACCEPTED
-    with MapClient(server.endpoint, receipt_timeout_s=0.05) as client:
+    with MapClient(server.endpoint, feed=FeedOptions(receipt_timeout_s=0.05)) as client:
         for _ in range(4):
             client.publish(cloud(), pose(), wait=True, timeout_s=LIMIT_S)
         assert client.flush(LIMIT_S)
@@ -188,12 +191,12 @@ def test_two_processes_with_one_robot_id_keep_their_own_receipts(
 
 
 def test_a_closed_subscription_is_forgotten(server: FakeServer, client: MapClient) -> None:
-    before = list(client._subscriptions)
+    before = list(client._link._subscriptions)
     for watch in (client.watch_revisions, client.watch_receipts, client.watch_stats, client.watch_params):
         with watch(lambda _: None) as subscription:  # type: ignore[operator]
-            assert subscription in client._subscriptions
+            assert subscription in client._link._subscriptions
         subscription.close()
-    assert client._subscriptions == before
+    assert client._link._subscriptions == before
 
 
 @pytest.mark.parametrize(
@@ -228,7 +231,7 @@ def test_a_message_of_another_kind_is_one_warning_line(
 
 def test_transported_parameters_arrive(server: FakeServer) -> None:
     got: queue.Queue[Any] = queue.Queue()
-    with MapClient(server.endpoint, on_params=got.put) as client:
+    with MapClient(server.endpoint, feed=FeedOptions(on_params=got.put)) as client:
         client.publish(cloud(), pose(), robot="a", wait=True)
         params = got.get(timeout=LIMIT_S)
     assert (params.robot, params.seq, len(params.kernels)) == ("a", 1, 1)
@@ -329,7 +332,7 @@ def test_a_grid_with_missing_parts_is_an_error(server: FakeServer, client: MapCl
 
 def test_a_grid_of_two_revisions_is_an_error(server: FakeServer, client: MapClient) -> None:
     server.script.mixed_revisions = True
-    with pytest.raises(IncompleteReplyError, match="revisions 0 and 1"):
+    with pytest.raises(IncompleteReplyError, match="map_revision 0 and 1"):
         client.grid([-2, -2, -2], [2, 1, 0.5], 0.5)
 
 
@@ -664,8 +667,8 @@ def test_closing_from_a_callback_ends(server: FakeServer) -> None:
 def test_a_process_that_forgets_to_close_ends(server: FakeServer, ending: str, status: int) -> None:
     program = f"""
 import numpy as np
-from potclient import MapClient
-client = MapClient({server.endpoint!r}, on_receipt=print)
+from potclient import FeedOptions, MapClient
+client = MapClient({server.endpoint!r}, feed=FeedOptions(on_receipt=print))
 client.watch_revisions(print)
 client.publish(np.ones((5, 3)), np.eye(4), wait=True)
 client.info()
@@ -680,7 +683,7 @@ client.info()
 def test_first_messages_may_come_on_many_threads_at_once() -> None:
     program = """
 import sys, threading
-from potclient.client import _decode
+from potclient.link import decoded as _decode
 from potschemas import messages
 from potschemas.wire import encode
 import zenoh
@@ -726,8 +729,8 @@ def test_playing_a_recording_accounts_for_every_scan(
     report = play(
         client,
         recording,
+        Sending(acknowledged=acknowledged),
         hold_out=HoldOut(0.2),
-        acknowledged=acknowledged,
         on_outcome=lambda outcome: seen.append(outcome.index),
     )
     assert report.all_accepted
@@ -764,7 +767,10 @@ def test_a_recording_that_fails_midway_reports_what_was_sent(server: FakeServer,
             client.close()
 
     report = play(
-        client, open_dataset("generated:2d", n_generated=4), acknowledged=True, on_outcome=close_after_two
+        client,
+        open_dataset("generated:2d", n_generated=4),
+        Sending(acknowledged=True),
+        on_outcome=close_after_two,
     )
     assert isinstance(report.failure, ClosedError)
     assert report.to_json()["failure"] == "the client is closed"
@@ -816,6 +822,6 @@ def test_a_question_whose_client_is_closed_meanwhile_says_so(
             client.close()
             return bool(querier.matching_status)
 
-        monkeypatch.setattr("potclient.client._is_matching", close_and_ask)
+        monkeypatch.setattr("potclient.link.is_matching", close_and_ask)
         with pytest.raises(ClosedError):
             client.info()
