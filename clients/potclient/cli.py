@@ -24,7 +24,7 @@ from potclient.commands import (
 )
 from potclient.commands.shared import EXIT_FAILED, EXIT_INTERRUPTED, EXIT_USAGE, complain
 from potclient.errors import DatasetError, MapServerError, PotclientError, UsageError
-from potclient.session import DEFAULT_ENDPOINT
+from potclient.zenoh_config import DEFAULT_ENDPOINT
 from potschemas import __version__
 
 _VERBS = (publish, query, grid, rays, risk, export, mirror, watch, load, info, atoms, map, town)

@@ -26,7 +26,8 @@ from potclient.errors import (
     UsageError,
     error_from_reply,
 )
-from potclient.session import DEFAULT_ENDPOINT, SessionOptions, open_session
+from potclient.session import SessionOptions, open_session
+from potclient.zenoh_config import DEFAULT_ENDPOINT
 from potschemas import messages
 from potschemas.keys import MapKeys
 from potschemas.messages import Message

@@ -18,13 +18,13 @@ from potclient.cli import build_parser, main
 from potclient.client import MapClient
 from potclient.errors import NoServerError, UsageError
 from potclient.session import (
-    DEFAULT_ENDPOINT,
     SessionOptions,
     add_zenoh_arguments,
     build_config,
     open_session,
     options_from_arguments,
 )
+from potclient.zenoh_config import DEFAULT_ENDPOINT
 from potschemas.keys import CONTROL_VERBS
 from potschemas.messages import ErrorCode, ReceiptStatus
 from tests.integration.fake_server import FakeServer, free_port

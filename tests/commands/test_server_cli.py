@@ -71,7 +71,6 @@ def test_flags_become_settings(capsys: pytest.CaptureFixture[str]) -> None:
         "config": "z.json5",
         "cfg": {"transport/link/tx/lease": "5000", "connect/endpoints": '["tcp/h:3"]'},
         "shared_memory": False,
-        "shared_memory_queries": False,
     }
     assert (tree["server_id"], tree["root"], tree["threads"]) == ("s1", "r", 2)
     assert (tree["drain_timeout_s"], tree["dictionary"]) == (3.0, "d.npz")
