@@ -104,11 +104,14 @@ class MapClient:
             if self._link.is_closed:
                 return
             self._link.end_waits()
-        teardown = threading.Thread(target=self._teardown, name="potclient-close", daemon=True)
+        caller = threading.current_thread()
+        teardown = threading.Thread(
+            target=self._teardown, args=(caller,), name="potclient-close", daemon=True
+        )
         try:
             teardown.start()
         except RuntimeError:  # the interpreter is shutting down and starts no more threads
-            self._teardown()
+            self._teardown(caller)
             return
         teardown.join(_CLOSE_S)
         if teardown.is_alive():
@@ -118,9 +121,9 @@ class MapClient:
                 _CLOSE_S,
             )
 
-    def _teardown(self) -> None:
+    def _teardown(self, caller: threading.Thread) -> None:
         self._clouds.close()
-        self._link.close()
+        self._link.close(caller)
         _open_clients.discard(self)
 
     # --- who serves -----------------------------------------------------------------------------------------------------------

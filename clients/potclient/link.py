@@ -11,6 +11,7 @@ import logging
 import math
 import threading
 import time
+import weakref
 from collections.abc import Callable, Iterator
 from typing import Any, TypeVar
 
@@ -37,6 +38,7 @@ log = logging.getLogger("potclient")
 
 MessageT = TypeVar("MessageT", bound=Message)
 
+_JOIN_S = 3.0  # for callbacks that still run when a link is closed
 _DIAGNOSIS_TIMEOUT_S = 0.5  # how long a silent question waits for the tokens of servers
 # megabytes take lanes of their own, so that they do not delay short questions and answers on the same link
 _BULK_LANES = {
@@ -76,6 +78,14 @@ class Subscription:
             self._subscriber.undeclare()
         self._on_close(self)
 
+    def runs_on(self, thread: threading.Thread) -> bool:
+        """Whether this is the thread that delivers."""
+        return thread is self._thread
+
+    def join(self, timeout_s: float) -> None:
+        """Wait until the thread has ended."""
+        self._thread.join(timeout_s)
+
     def __enter__(self) -> Subscription:
         return self
 
@@ -105,18 +115,25 @@ class Link:
         self._queriers: dict[str, zenoh.Querier] = {}
         self._declared: list[Any] = []
         self._subscriptions: list[Subscription] = []
+        self._readers: weakref.WeakSet[Subscription] = weakref.WeakSet()  # all whose threads may still run
         self._session = open_session(options)
         try:
             tokens = self._session.liveliness().declare_subscriber(
                 f"@{keys.root}/srv/*/*", zenoh.handlers.FifoChannel(64), history=True
             )
-            self._subscriptions.append(Subscription(tokens, self._note_server, "servers", self._forget))
+            self._add(Subscription(tokens, self._note_server, "servers", self._forget))
         except BaseException:
             self.close()
             raise
 
-    def close(self) -> None:
-        """Undeclare everything and close the session. May take seconds; a second call does nothing."""
+    def close(self, caller: threading.Thread | None = None) -> None:
+        """Undeclare everything and close the session. May take seconds; a second call does nothing.
+
+        Args:
+            caller: The thread that waits for this, by default this one. Where it is a subscription's own, in a callback, its
+                end is not waited for.
+        """
+        caller = caller or threading.current_thread()
         self.end_waits()
         for subscription in list(self._subscriptions):
             subscription.close()
@@ -127,6 +144,11 @@ class Link:
                 entity.undeclare()
         with contextlib.suppress(zenoh.ZError):
             self._session.close()
+        # A thread that comes back from Zenoh while the interpreter shuts down aborts the process.
+        until = time.monotonic() + _JOIN_S
+        for reader in list(self._readers):
+            if not reader.runs_on(caller):
+                reader.join(max(0.0, until - time.monotonic()))
 
     def end_waits(self) -> None:
         """Refuse all calls from now on, and end those that wait for a server."""
@@ -317,8 +339,7 @@ class Link:
                 name,
                 self._forget,
             )
-            self._subscriptions.append(subscription)
-            return subscription
+            return self._add(subscription)
 
     def publisher(self, key: str, kind: type[Message], **qos: Any) -> zenoh.Publisher:
         """A publisher of messages of one kind, undeclared with the link.
@@ -344,6 +365,11 @@ class Link:
         """Declare the liveliness token of a robot that feeds this map; it goes with the link."""
         with self._lock:
             self._declared.append(self._session.liveliness().declare_token(self.keys.robot_token(robot)))
+
+    def _add(self, subscription: Subscription) -> Subscription:
+        self._subscriptions.append(subscription)
+        self._readers.add(subscription)
+        return subscription
 
     def _forget(self, subscription: Subscription) -> None:
         with self._lock, contextlib.suppress(ValueError):  # closed twice

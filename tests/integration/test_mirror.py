@@ -21,7 +21,7 @@ from potserver.config import load_settings
 from potserver.server import MapServer
 
 from .conftest import Client, make_cloud, until
-from .fake_server import free_port
+from .scripted import free_port
 
 POINTS = np.random.default_rng(0).uniform([-8, -7, -2], [38, 7, 3], (400, 3))
 SETTINGS = {
