@@ -39,7 +39,9 @@ class Clouds:
 
     def close(self) -> None:
         """End all feeds; what was not sent counts as dropped, what has no receipt as unknown."""
-        for feed in list(self._feeds.values()):
+        with self._lock:  # a feed that is being opened is closed too
+            feeds = list(self._feeds.values())
+        for feed in feeds:
             feed.close()
 
     def integrate(

@@ -135,10 +135,11 @@ class Link:
         """
         caller = caller or threading.current_thread()
         self.end_waits()
-        for subscription in list(self._subscriptions):
-            subscription.close()
-        with self._lock:
+        with self._lock:  # what is being declared is undeclared too
+            subscriptions = list(self._subscriptions)
             declared, self._declared = self._declared, []
+        for subscription in subscriptions:
+            subscription.close()
         for entity in declared:
             with contextlib.suppress(zenoh.ZError):
                 entity.undeclare()
