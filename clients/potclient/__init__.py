@@ -8,7 +8,7 @@ with MapClient("tcp/127.0.0.1:7447", map="default") as client:
 """
 
 from potclient.atoms import Atom
-from potclient.client import MapClient, Subscription
+from potclient.client import MapClient
 from potclient.errors import (
     AtomRefusedError,
     BadMessageError,
@@ -42,9 +42,13 @@ from potclient.errors import (
     UnsupportedError,
     UsageError,
 )
+from potclient.feed import FeedOptions
 from potclient.kernels import KernelSet
+from potclient.link import Subscription
 from potclient.mirror import MapMirror, MirrorUpdate
-from potclient.results import FeedCounts, Grid, Occupancy, Rays, Receipt, Risk, TransportedParams
+from potclient.questions.rays import Rays
+from potclient.questions.risk import Risk
+from potclient.results import FeedCounts, Grid, Occupancy, Receipt, TransportedParams
 from potclient.session import SessionOptions
 from potschemas import __version__
 
@@ -60,6 +64,7 @@ __all__ = [
     "DeadlineError",
     "EmptyError",
     "FeedCounts",
+    "FeedOptions",
     "Grid",
     "IncompleteReplyError",
     "InternalError",

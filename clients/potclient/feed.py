@@ -8,6 +8,7 @@ a cloud that the server had to drop the feed pauses, longer each time, up to a s
 
 from __future__ import annotations
 
+import dataclasses
 import secrets
 import threading
 import time
@@ -17,7 +18,7 @@ from collections.abc import Callable, Iterator
 import msgspec
 
 from potclient.errors import ClosedError, QueryTimeoutError, UsageError
-from potclient.results import FeedCounts, Receipt
+from potclient.results import FeedCounts, Receipt, TransportedParams
 from potschemas import messages
 from potschemas.messages import ReceiptStatus
 
@@ -25,6 +26,22 @@ _MATCH_POLL_S = 0.02  # only while a cloud waits and no server listens
 _BACKOFF_S = (0.05, 1.0)  # after a cloud that the server dropped: first, longest
 _MAX_EXPIRED = 4096  # clouds whose receipt may still come late
 _MAX_RECEIPTS = 4096  # receipts kept for the iterator
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class FeedOptions:
+    """How a client publishes clouds."""
+
+    credit: int = 2  # published clouds of a robot that may be without a receipt
+    receipt_timeout_s: float = 10.0  # after this long without a receipt a cloud counts as unknown
+    # Called with every receipt of a published cloud, on a thread of the client's: keep it short, the next credit waits for it.
+    on_receipt: Callable[[Receipt], None] | None = None
+    # Called with the transported parameters of published clouds; a slow callback misses some: their numbers jump.
+    on_params: Callable[[TransportedParams], None] | None = None
+
+    def __post_init__(self) -> None:
+        if self.receipt_timeout_s <= 0 or self.credit < 1:
+            raise UsageError("receipt_timeout_s must be positive, credit at least 1")
 
 
 def first_number() -> int:

@@ -6,6 +6,7 @@ import dataclasses
 import threading
 import time
 from collections import Counter
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import msgspec
@@ -14,6 +15,7 @@ import numpy as np
 from potclient.client import MapClient
 from potclient.datasets.scans import RecordedScan, Recording
 from potclient.errors import OverloadedError, PotclientError, UsageError
+from potclient.feed import FeedOptions
 from potclient.results import FeedCounts, Float64, Receipt
 from potclient.session import SessionOptions
 from potschemas.keys import DEFAULT_ROOT
@@ -132,6 +134,28 @@ class _Tally:
             self.failed[type(error).__name__] += 1
             self.examples.setdefault(type(error).__name__, str(error))
 
+    def report(
+        self, settings: LoadSettings, elapsed_s: float, stats: dict[str, Any] | None, *, interrupted: bool
+    ) -> LoadReport:
+        """All of it."""
+        with self.lock:
+            return LoadReport(
+                settings=settings,
+                elapsed_s=elapsed_s,
+                clouds=self.counts,
+                reasons=dict(sorted(self.reasons.items())),
+                receipts=Percentiles.of(self.receipt_s),
+                integrate=Percentiles.of(self.integrate_s),
+                asked=self.asked,
+                answered=len(self.query_s),
+                overloaded=self.overloaded,
+                failed=dict(sorted(self.failed.items())),
+                queries=Percentiles.of(self.query_s),
+                examples=self.examples,
+                server_stats=stats,
+                interrupted=interrupted,
+            )
+
 
 def run_load(
     settings: LoadSettings,
@@ -157,114 +181,103 @@ def run_load(
     tally = _Tally()
 
     def connect() -> MapClient:
+        feed = FeedOptions(receipt_timeout_s=settings.receipt_timeout_s, on_receipt=tally.on_receipt)
         return MapClient(
-            map=map_id,
-            root=root,
-            options=options,
-            timeout_s=settings.query_timeout_s,
-            receipt_timeout_s=settings.receipt_timeout_s,
-            on_receipt=tally.on_receipt,
+            map=map_id, root=root, options=options, timeout_s=settings.query_timeout_s, feed=feed
         )
 
     with connect() as control:
         control.wait_ready(max(settings.query_timeout_s, options.connect_timeout_s))
         started = time.monotonic()
-        until = started + settings.duration_s
-        threads = [
-            threading.Thread(
-                target=_robot, args=(i, connect, scans, settings, until, stop, tally), daemon=True
-            )
-            for i in range(settings.robots)
-        ] + [
-            threading.Thread(
-                target=_planner, args=(i, connect, box, settings, until, stop, tally), daemon=True
-            )
-            for i in range(settings.planners)
-        ]
-        for thread in threads:
-            thread.start()
-        interrupted = False
-        try:
-            for thread in threads:
-                thread.join()
-        except KeyboardInterrupt:  # what was sent so far still gets its place
-            interrupted = True
-            stop.set()
-            for thread in threads:
-                thread.join()
+        crew = _Crew(settings, connect, tally, started + settings.duration_s, stop)
+        crew.start(scans, box)
+        interrupted = crew.join()
         elapsed_s = time.monotonic() - started
         stats: dict[str, Any] | None = None
         try:
             stats = msgspec.to_builtins(control.stats())
         except PotclientError as error:
             tally.examples["server_stats"] = str(error)
-    with tally.lock:
-        return LoadReport(
-            settings=settings,
-            elapsed_s=elapsed_s,
-            clouds=tally.counts,
-            reasons=dict(sorted(tally.reasons.items())),
-            receipts=Percentiles.of(tally.receipt_s),
-            integrate=Percentiles.of(tally.integrate_s),
-            asked=tally.asked,
-            answered=len(tally.query_s),
-            overloaded=tally.overloaded,
-            failed=dict(sorted(tally.failed.items())),
-            queries=Percentiles.of(tally.query_s),
-            examples=tally.examples,
-            server_stats=stats,
-            interrupted=interrupted,
-        )
+    return tally.report(settings, elapsed_s, stats, interrupted=interrupted)
 
 
-def _robot(
-    i: int,
-    connect: Any,
-    scans: list[RecordedScan],
-    settings: LoadSettings,
-    until: float,
-    stop: threading.Event,
-    tally: _Tally,
-) -> None:
-    robot = f"{settings.robot_prefix}-{i}"
-    try:
-        with connect() as client:
-            beat = time.monotonic() + i / max(1, settings.robots) / settings.rate_hz  # robots are not in step
-            k = i * len(scans) // max(1, settings.robots)
-            while beat < until and not stop.wait(max(0.0, beat - time.monotonic())):
-                scan = scans[k % len(scans)]
-                client.publish(scan.to_send, scan.T_map_sensor, is_return=scan.is_return, robot=robot)
-                k += 1
-                beat += 1.0 / settings.rate_hz
-            client.flush(2 * settings.receipt_timeout_s + 6.0)  # both credits may run out one after the other
-            client.flush(settings.receipt_timeout_s, late=True)
-    except PotclientError as error:
-        tally.fail(error)
-    finally:
-        with tally.lock:
-            if "client" in locals():
-                tally.counts += client.counts()
+class _Crew:
+    """The robots and planners, a thread and a session each."""
 
+    def __init__(
+        self,
+        settings: LoadSettings,
+        connect: Callable[[], MapClient],
+        tally: _Tally,
+        until: float,
+        stop: threading.Event,
+    ) -> None:
+        self._settings, self._connect, self._tally = settings, connect, tally
+        self._until, self._stop = until, stop
+        self._threads: list[threading.Thread] = []
 
-def _planner(
-    i: int,
-    connect: Any,
-    box: Float64,
-    settings: LoadSettings,
-    until: float,
-    stop: threading.Event,
-    tally: _Tally,
-) -> None:
-    rng = np.random.default_rng((settings.seed, i))
-    try:
-        with connect() as client:
-            beat = time.monotonic()
-            while beat < until and not stop.wait(max(0.0, beat - time.monotonic())):
-                points = rng.uniform(box[0], box[1], (settings.query_points, 3)).astype(np.float32)
-                _ask(client, points, tally)
-                beat = max(beat + 1.0 / settings.planner_hz, time.monotonic())
-    except PotclientError as error:
-        tally.fail(error)
+    def start(self, scans: list[RecordedScan], box: Float64) -> None:
+        """Let all of them work: robots send these scans, planners ask inside this box (2, 3) m."""
+        s = self._settings
+        work: list[tuple[Callable[[int, Any], None], int, Any]] = [
+            (self._robot, i, scans) for i in range(s.robots)
+        ]
+        work += [(self._planner, i, box) for i in range(s.planners)]
+        for run, i, what in work:
+            thread = threading.Thread(target=run, args=(i, what), daemon=True)
+            thread.start()
+            self._threads.append(thread)
+
+    def join(self) -> bool:
+        """Wait until all have ended; whether it was interrupted."""
+        try:
+            for thread in self._threads:
+                thread.join()
+        except KeyboardInterrupt:  # what was sent so far still gets its place
+            self._stop.set()
+            for thread in self._threads:
+                thread.join()
+            return True
+        return False
+
+    def _robot(self, i: int, scans: list[RecordedScan]) -> None:
+        s = self._settings
+        robot = f"{s.robot_prefix}-{i}"
+        client: MapClient | None = None
+        try:
+            with self._connect() as client:
+                beat = time.monotonic() + i / max(1, s.robots) / s.rate_hz  # robots are not in step
+                k = i * len(scans) // max(1, s.robots)
+                while self._waits_for(beat):
+                    scan = scans[k % len(scans)]
+                    client.publish(scan.to_send, scan.T_map_sensor, is_return=scan.is_return, robot=robot)
+                    k += 1
+                    beat += 1.0 / s.rate_hz
+                client.flush(2 * s.receipt_timeout_s + 6.0)  # both credits may run out one after the other
+                client.flush(s.receipt_timeout_s, late=True)
+        except PotclientError as error:
+            self._tally.fail(error)
+        finally:
+            if client is not None:
+                with self._tally.lock:
+                    self._tally.counts += client.counts()
+
+    def _planner(self, i: int, box: Float64) -> None:
+        s = self._settings
+        rng = np.random.default_rng((s.seed, i))
+        try:
+            with self._connect() as client:
+                beat = time.monotonic()
+                while self._waits_for(beat):
+                    points = rng.uniform(box[0], box[1], (s.query_points, 3)).astype(np.float32)
+                    _ask(client, points, self._tally)
+                    beat = max(beat + 1.0 / s.planner_hz, time.monotonic())
+        except PotclientError as error:
+            self._tally.fail(error)
+
+    def _waits_for(self, beat: float) -> bool:
+        """Wait for the beat; false if the test ends before."""
+        return beat < self._until and not self._stop.wait(max(0.0, beat - time.monotonic()))
 
 
 def _ask(client: MapClient, points: Any, tally: _Tally) -> None:

@@ -12,8 +12,9 @@ import msgspec
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from potclient.errors import BadReplyError, IncompleteReplyError, UsageError
+from potclient.errors import BadReplyError, UsageError
 from potclient.kernels import KernelSet
+from potclient.parts import PartCheck
 from potclient.results import Bool, Float32, Float64, Occupancy
 from potschemas.answers import RULE_FIELDS, AnswerRule
 from potschemas.messages import MAX_PART_KERNELS, CodedKernels, DType, Packed, TilesPart, TilesQuery
@@ -23,7 +24,7 @@ Int64 = NDArray[np.int64]
 TileIndex = tuple[int, int, int]  # floor(p_map / tile_size_m)
 Ask = Callable[[TilesQuery], Iterator[tuple[TilesPart, int]]]  # the parts of the reply, with their bytes
 
-_SAME_IN_ALL_PARTS = ("n_parts", "epoch", "map_revision", "whole", "tile_size_m", *RULE_FIELDS)
+_SAME_IN_ALL_PARTS = ("epoch", "map_revision", "whole", "tile_size_m", *RULE_FIELDS)
 _CELLS = (DType.UINT8, DType.INT64)
 
 
@@ -163,22 +164,13 @@ class _Reply:
     """A reply in the making; refuses what does not fit."""
 
     def __init__(self) -> None:
+        self._check = PartCheck("tiles")
         self._parts: dict[int, tuple[TilesPart, list[tuple[TileIndex, _Tile]]]] = {}
-        self._first: TilesPart | None = None
         self._n_bytes = 0
 
     def add(self, part: TilesPart, n_bytes: int) -> None:
-        first = self._first = self._first or part
-        for name in _SAME_IN_ALL_PARTS:
-            if getattr(part, name) != getattr(first, name):
-                raise IncompleteReplyError(
-                    f"tiles: parts of {name} {getattr(first, name)} and {getattr(part, name)};"
-                    " do two servers serve this map?"
-                )
-        if part.part in self._parts or part.part >= part.n_parts:
-            raise IncompleteReplyError(
-                f"tiles: part {part.part} of {part.n_parts} came twice or has no place; do two servers serve this map?"
-            )
+        same = {name: getattr(part, name) for name in _SAME_IN_ALL_PARTS}
+        self._check.add(part.part, part.n_parts, **same)
         try:
             self._parts[part.part] = (part, list(_tiles_of(part)))
         except WireError as error:
@@ -187,10 +179,8 @@ class _Reply:
 
     def applied_to(self, state: _State | None) -> tuple[_State, MirrorUpdate]:
         """What was before, with all that came in its place; and what came."""
-        first = self._first
-        if first is None or len(self._parts) != first.n_parts:
-            n_parts = 0 if first is None else first.n_parts
-            raise IncompleteReplyError(f"tiles: {len(self._parts)} of {n_parts} parts came")
+        self._check.finish()
+        first = self._parts[0][0]
         if first.whole != (state is None or state.epoch != first.epoch):
             raise BadReplyError(
                 f"tiles: whole is {first.whole}, in epoch {first.epoch} after {state and state.epoch}"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -12,6 +13,8 @@ from potclient.errors import UsageError
 from potclient.results import Grid
 
 _UNKNOWN = "#e4e4e4"
+_ECHOES: dict[str, Any] = {"color": "black", "markersize": 0.8, "alpha": 0.5}
+_TRACK: dict[str, Any] = {"color": "white", "mec": "black", "markersize": 4, "linewidth": 1}
 
 
 def draw_layer(
@@ -42,13 +45,10 @@ def draw_layer(
     matplotlib.use("Agg")
     from matplotlib import pyplot
 
-    nx, ny, nz = grid.shape
-    z_low, cell = float(grid.lower[2]), grid.resolution
-    layer = nz // 2 if level_m is None else math.floor((level_m - z_low) / cell)
-    if not 0 <= layer < nz:
-        raise UsageError(f"level {level_m} m is outside the grid, {z_low:g} to {z_low + nz * cell:g} m")
+    layer, z = _layer_at(grid, level_m)
+    nx, ny, _ = grid.shape
     x, y = float(grid.lower[0]), float(grid.lower[1])
-    extent = (x, x + nx * cell, y, y + ny * cell)
+    extent = (x, x + nx * grid.resolution, y, y + ny * grid.resolution)
     known = grid.observed[:, :, layer]
     width = 6.4
     height = float(np.clip(width * ny / nx, 2.5, 9.0))
@@ -66,37 +66,26 @@ def draw_layer(
         )
         if hits is not None:
             points = np.asarray(hits, np.float64)
-            thick = max(cell, 0.15)
-            points = points[np.abs(points[:, 2] - (z_low + (layer + 0.5) * cell)) <= thick]
-            axis.plot(
-                points[:, 0],
-                points[:, 1],
-                ".",
-                color="black",
-                markersize=0.8,
-                alpha=0.5,
-                label="echoes in this layer",
-            )
+            points = points[np.abs(points[:, 2] - z) <= max(grid.resolution, 0.15)]
+            axis.plot(*points[:, :2].T, ".", label="echoes in this layer", **_ECHOES)
         if path_of_sensor is not None:
             track = np.asarray(path_of_sensor, np.float64)
-            axis.plot(
-                track[:, 0],
-                track[:, 1],
-                "o-",
-                color="white",
-                mec="black",
-                markersize=4,
-                linewidth=1,
-                label="sensor",
-            )
+            axis.plot(*track[:, :2].T, "o-", label="sensor", **_TRACK)
         axis.set(title=name, xlabel="x [m]", xlim=extent[:2], ylim=extent[2:])
         figure.colorbar(image, ax=axis, shrink=0.8)
     axes[0].set_ylabel("y [m]")
     if hits is not None or path_of_sensor is not None:
         axes[0].legend(loc="upper right", fontsize="x-small")
     head = f"{title}, " if title else ""
-    figure.suptitle(
-        f"{head}z = {z_low + (layer + 0.5) * cell:.2f} m, revision {grid.revision}, grey = unknown"
-    )
+    figure.suptitle(f"{head}z = {z:.2f} m, revision {grid.revision}, grey = unknown")
     figure.savefig(path, dpi=110)
     pyplot.close(figure)
+
+
+def _layer_at(grid: Grid, level_m: float | None) -> tuple[int, float]:
+    """The layer at a height, the middle one for None, and the height of its middle, m."""
+    z_low, cell, nz = float(grid.lower[2]), grid.resolution, grid.shape[2]
+    layer = nz // 2 if level_m is None else math.floor((level_m - z_low) / cell)
+    if not 0 <= layer < nz:
+        raise UsageError(f"level {level_m} m is outside the grid, {z_low:g} to {z_low + nz * cell:g} m")
+    return layer, z_low + (layer + 0.5) * cell

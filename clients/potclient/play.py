@@ -72,36 +72,40 @@ class PlayReport:
         }
 
 
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class Sending:
+    """How the scans of a recording are sent."""
+
+    robot: str = "r1"
+    rate_hz: float | None = None  # scans a second at most; None goes as fast as the receipts come
+    lossless: bool = True  # wait for credit; false drops the older cloud as a live robot does
+    acknowledged: bool = False  # send by `integrate` instead, one after the other
+    # Send the recorded stamps. A server refuses stamps that do not grow, and with them a second round.
+    keep_stamps: bool = False
+
+
 def play(
     client: MapClient,
     recording: Recording,
+    sending: Sending | None = None,
     *,
-    robot: str = "r1",
-    rate_hz: float | None = None,
-    lossless: bool = True,
-    acknowledged: bool = False,
-    keep_stamps: bool = False,
     hold_out: HoldOut | None = None,
     max_test_points: int = 200_000,
     on_outcome: Callable[[ScanOutcome], None] | None = None,
 ) -> PlayReport:
     """Send all scans of a recording and wait for what becomes of them.
 
-    Scans are stamped with the time of sending unless `keep_stamps`, since a server refuses stamps that do not grow and would
-    therefore refuse a second round.
-
     Args:
-        rate_hz: Scans a second at most; None goes as fast as the receipts come.
-        lossless: Wait for credit; false drops the older cloud as a live robot does.
-        acknowledged: Send by `integrate` instead, one after the other.
+        sending: For which robot, how fast, and in which way; by default published, as fast as the receipts come.
         hold_out: Keep these beams back and score the map on them at the end.
         max_test_points: Score a fixed-seed sample when there are more.
         on_outcome: Called with every outcome as it is known, on a thread of the client's.
     Raises:
         PotclientError, KeyboardInterrupt: before the first scan was sent; later the report has them as `failure`.
     """
+    sending = sending or Sending()
     started = time.monotonic()
-    book = _Book(on_outcome)
+    book = _Book(client, sending, on_outcome)
     labelled: list[LabelledPoints] = []
     failure: PotclientError | KeyboardInterrupt | None = None
     previous, client.on_receipt = client.on_receipt, book.on_receipt
@@ -111,13 +115,9 @@ def play(
             if hold_out is not None:
                 scan, labels = hold_out.split(scan)
                 labelled.append(labels)
-            if rate_hz is not None:
-                time.sleep(max(0.0, started + index / rate_hz - time.monotonic()))
-            stamp_ns = scan.stamp_ns if keep_stamps else None
-            if acknowledged:
-                book.integrate(client, robot, index, scan, stamp_ns)
-            else:
-                book.publish(client, robot, index, scan, stamp_ns, wait=lossless)
+            if sending.rate_hz is not None:
+                time.sleep(max(0.0, started + index / sending.rate_hz - time.monotonic()))
+            book.send(index, scan)
         client.flush()  # ends: a credit without a receipt runs out
     except (PotclientError, KeyboardInterrupt) as error:
         if book.is_empty:
@@ -125,7 +125,7 @@ def play(
         failure = error
     finally:
         client.on_receipt = previous
-    report = PlayReport(scans=book.finish(lossless), elapsed_s=time.monotonic() - started, failure=failure)
+    report = PlayReport(scans=book.finish(), elapsed_s=time.monotonic() - started, failure=failure)
     if hold_out is None or failure is not None:
         return report
     labels = LabelledPoints.concatenate(labelled)
@@ -151,58 +151,41 @@ def score_map(
 class _Book:
     """Which scan has which number, and what its receipt said; receipts may come before `publish` returns."""
 
-    def __init__(self, on_outcome: Callable[[ScanOutcome], None] | None) -> None:
-        self._on_outcome = on_outcome
+    def __init__(
+        self, client: MapClient, sending: Sending, on_outcome: Callable[[ScanOutcome], None] | None
+    ) -> None:
+        self._client, self._sending, self._on_outcome = client, sending, on_outcome
         self._lock = threading.Lock()
         self._sent: dict[int, tuple[int, RecordedScan]] = {}
         self._early: dict[int, Receipt] = {}
         self._outcomes: dict[int, ScanOutcome] = {}
 
-    def publish(
-        self,
-        client: MapClient,
-        robot: str,
-        index: int,
-        scan: RecordedScan,
-        stamp_ns: int | None,
-        *,
-        wait: bool,
-    ) -> None:
-        seq = client.publish(
-            scan.to_send,
-            scan.T_map_sensor,
-            robot=robot,
-            is_return=scan.is_return,
-            stamp_ns=stamp_ns,
-            wait=wait,
-        )
+    def send(self, index: int, scan: RecordedScan) -> None:
+        """Publish or integrate a scan."""
+        cloud: dict[str, Any] = {
+            "points": scan.to_send,
+            "T_map_sensor": scan.T_map_sensor,
+            "is_return": scan.is_return,
+            "robot": self._sending.robot,
+            "stamp_ns": scan.stamp_ns if self._sending.keep_stamps else None,
+        }
+        if self._sending.acknowledged:
+            self._integrate(index, scan, cloud)
+            return
+        seq = self._client.publish(**cloud, wait=self._sending.lossless)
         with self._lock:
             self._sent[seq] = (index, scan)
             receipt = self._early.pop(seq, None)
         if receipt is not None:
             self.on_receipt(receipt)
 
-    def integrate(
-        self, client: MapClient, robot: str, index: int, scan: RecordedScan, stamp_ns: int | None
-    ) -> None:
+    def _integrate(self, index: int, scan: RecordedScan, cloud: dict[str, Any]) -> None:
         try:
-            receipt = client.integrate(
-                scan.to_send, scan.T_map_sensor, robot=robot, is_return=scan.is_return, stamp_ns=stamp_ns
-            )
+            receipt = self._client.integrate(**cloud)
         except MapServerError as error:
             if error.receipt is None:
                 status = "dropped" if error.retryable else "rejected"
-                self._book(
-                    ScanOutcome(
-                        index=index,
-                        name=scan.name,
-                        seq=0,
-                        n_points=len(scan),
-                        status=status,
-                        reason=error.code,
-                        message=str(error),
-                    )
-                )
+                self._book(_unsettled(index, scan, status, reason=error.code, message=str(error)))
                 return
             receipt = error.receipt
         self._book(_outcome(index, scan, receipt))
@@ -227,15 +210,19 @@ class _Book:
         with self._lock:
             return not self._sent and not self._outcomes
 
-    def finish(self, lossless: bool) -> list[ScanOutcome]:
+    def finish(self) -> list[ScanOutcome]:
         """All outcomes in order; a scan without a receipt is unknown, or was dropped by the client where it may do so."""
+        status = "unknown" if self._sending.lossless else "dropped_by_client"
         for seq, (index, scan) in self._sent.items():
             if index not in self._outcomes:
-                status = "unknown" if lossless else "dropped_by_client"
-                self._book(
-                    ScanOutcome(index=index, name=scan.name, seq=seq, n_points=len(scan), status=status)
-                )
+                self._book(_unsettled(index, scan, status, seq=seq))
         return [self._outcomes[i] for i in sorted(self._outcomes)]
+
+
+def _unsettled(index: int, scan: RecordedScan, status: str, **more: Any) -> ScanOutcome:
+    """The outcome of a scan without a receipt."""
+    fields = {"seq": 0} | more
+    return ScanOutcome(index=index, name=scan.name, n_points=len(scan), status=status, **fields)
 
 
 def _outcome(index: int, scan: RecordedScan, receipt: Receipt) -> ScanOutcome:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
+from collections.abc import Mapping
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -25,7 +26,6 @@ Bool = NDArray[np.bool_]
 
 _FIELDS = ("mean", "var", "latent_mean", "latent_var", "observed")
 _GRADIENTS = ("gradient", "latent_gradient")
-_RAY_FIELDS = ("hit_probability", "mean_m", "std_m", "unknown_range_m", "unknown_share")
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -60,23 +60,28 @@ class Occupancy:
         Raises:
             BadReplyError: it does not hold n answers of the promised dtypes, or not the gradients that were asked for.
         """
-        gradients: dict[str, Float32] = {}
-        try:
-            for name in _GRADIENTS if with_gradient else ():
-                array = getattr(message, name)
-                if array is messages.ABSENT:
-                    raise BadReplyError(f"{what}: no {name} came; the server is older than this question")
-                gradients[name] = decode_array(array, f"{what}.{name}", dtypes=(DType.FLOAT32,), shape=(n, 3))
-            floats = {
-                name: decode_array(
-                    getattr(message, name), f"{what}.{name}", dtypes=(DType.FLOAT32,), shape=(n,)
-                )
-                for name in _FIELDS[:-1]
-            }
-            observed = decode_array(message.observed, f"{what}.observed", dtypes=(DType.BOOL,), shape=(n,))
-        except WireError as error:
-            raise BadReplyError(str(error)) from error
-        return cls(**floats, **gradients, observed=observed, revisions=(message.map_revision,))
+        shapes: dict[str, tuple[int, ...]] = dict.fromkeys(_FIELDS[:-1], (n,))
+        if with_gradient:
+            shapes |= dict.fromkeys(_GRADIENTS, (n, 3))
+        arrays = arrays_of(message, what, shapes)
+        observed = arrays_of(message, what, {"observed": (n,)}, DType.BOOL)
+        return cls(**arrays, **observed, revisions=(message.map_revision,))
+
+    @classmethod
+    def empty(cls, *, with_gradient: bool) -> Occupancy:
+        """The answer at no points."""
+        none = np.zeros(0, np.float32)
+        slopes: dict[str, Any] = (
+            dict.fromkeys(_GRADIENTS, np.zeros((0, 3), np.float32)) if with_gradient else {}
+        )
+        return cls(
+            mean=none,
+            var=none,
+            latent_mean=none,
+            latent_var=none,
+            observed=np.zeros(0, np.bool_),
+            **slopes,
+        )
 
     @staticmethod
     def concatenate(parts: list[Occupancy]) -> Occupancy:
@@ -120,101 +125,6 @@ class Grid:
             resolution=np.float64(self.resolution),
             revision=np.int64(self.revision),
             **{name: getattr(self, name) for name in _FIELDS},
-        )
-
-
-@dataclasses.dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class Rays:
-    """The distribution of min(first return, maximum range) of N rays, in the order asked; ranges from the origins."""
-
-    hit_probability: Float32  # (N,) of a return before the maximum range
-    mean_m: Float32  # (N,) expected range
-    std_m: Float32  # (N,) its standard deviation
-    quantile_m: Float32  # (N, Q); the maximum range, where a return before it is too unlikely
-    unknown_range_m: Float32  # (N,) where the ray first enters unobserved space; NaN: nowhere before it ends
-    unknown_share: Float32  # (N,) of the ray's expected length, in unobserved space
-    quantiles: tuple[float, ...]  # the Q that were asked for
-    step_m: float  # the longest step that was taken
-    revisions: tuple[int, ...] = (0,)  # as in `Occupancy`
-
-    def __len__(self) -> int:
-        return len(self.mean_m)
-
-    @property
-    def revision(self) -> int:
-        """The oldest map revision that answered a part of the request."""
-        return self.revisions[0]
-
-    @classmethod
-    def from_message(cls, message: messages.Rays, n: int, quantiles: tuple[float, ...]) -> Rays:
-        """The answer in a message.
-
-        Raises:
-            BadReplyError: it does not hold n answers of the promised dtypes.
-        """
-        shapes = dict.fromkeys(_RAY_FIELDS, (n,)) | {"quantile_m": (n, len(quantiles))}
-        try:
-            arrays: dict[str, Any] = {
-                name: decode_array(
-                    getattr(message, name), f"rays.{name}", dtypes=(DType.FLOAT32,), shape=shape
-                )
-                for name, shape in shapes.items()
-            }
-        except WireError as error:
-            raise BadReplyError(str(error)) from error
-        return cls(**arrays, quantiles=quantiles, step_m=message.step_m, revisions=(message.map_revision,))
-
-    @staticmethod
-    def concatenate(parts: list[Rays]) -> Rays:
-        """All answers in order, all revisions that gave them, and the longest step."""
-        names = (*_RAY_FIELDS, "quantile_m")
-        arrays: dict[str, Any] = {name: np.concatenate([getattr(p, name) for p in parts]) for name in names}
-        return Rays(
-            **arrays,
-            quantiles=parts[0].quantiles,
-            step_m=max(p.step_m for p in parts),
-            revisions=tuple(sorted({r for p in parts for r in p.revisions})),
-        )
-
-
-@dataclasses.dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class Risk:
-    """How likely a robot on P poses touches something, by the cells of a lattice that it covers."""
-
-    max_probability: Float32  # (P,) of the likeliest cell: all cells are one trial
-    union_probability: Float32  # (P,) that any cell is occupied: cells further apart are independent
-    unknown_share: Float32  # (P,) of its cells, unobserved
-    path_max_probability: float
-    path_union_probability: float  # every cell of the swept volume counted once
-    path_unknown_share: float
-    n_cells: int  # of the swept volume
-    resolution_m: float  # edge of a cell
-    revision: int
-
-    @classmethod
-    def from_message(cls, message: messages.Risk, n: int) -> Risk:
-        """The answer in a message.
-
-        Raises:
-            BadReplyError: it does not hold n answers of the promised dtypes.
-        """
-        try:
-            arrays: dict[str, Any] = {
-                name: decode_array(
-                    getattr(message, name), f"risk.{name}", dtypes=(DType.FLOAT32,), shape=(n,)
-                )
-                for name in ("max_probability", "union_probability", "unknown_share")
-            }
-        except WireError as error:
-            raise BadReplyError(str(error)) from error
-        return cls(
-            **arrays,
-            path_max_probability=message.path_max_probability,
-            path_union_probability=message.path_union_probability,
-            path_unknown_share=message.path_unknown_share,
-            n_cells=message.n_cells,
-            resolution_m=message.resolution_m,
-            revision=message.map_revision,
         )
 
 
@@ -328,6 +238,26 @@ class FeedCounts:
         return FeedCounts(
             **{f.name: getattr(self, f.name) + getattr(other, f.name) for f in dataclasses.fields(FeedCounts)}
         )
+
+
+def arrays_of(
+    message: messages.Message, what: str, shapes: Mapping[str, tuple[int, ...]], dtype: DType = DType.FLOAT32
+) -> dict[str, Any]:
+    """Arrays of a message, by the names of its fields.
+
+    Raises:
+        BadReplyError: one is absent, or of another dtype, shape or byte count.
+    """
+    arrays = {}
+    for name, shape in shapes.items():
+        array = getattr(message, name)
+        if array is messages.ABSENT:
+            raise BadReplyError(f"{what}: no {name} came; the server is older than this question")
+        try:
+            arrays[name] = decode_array(array, f"{what}.{name}", dtypes=(dtype,), shape=shape)
+        except WireError as error:
+            raise BadReplyError(str(error)) from error
+    return arrays
 
 
 def as_points(points: ArrayLike) -> Float64:

@@ -1,25 +1,18 @@
-"""Zenoh sessions for clients: the configuration, and the command line flags that Zenoh users expect.
-
-Precedence: flags > `--cfg` > the file of `--config` or ZENOH_CONFIG > what is set here.
-"""
+"""Zenoh sessions for clients, and the command line flags that Zenoh users expect."""
 
 from __future__ import annotations
 
 import argparse
 import dataclasses
 import json
-import os
-import re
 from collections.abc import Sequence
 from pathlib import Path
 
 import zenoh
 
+from potclient import zenoh_config
 from potclient.errors import NoServerError, UsageError
-
-DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
-_PROTOCOLS = ("tcp", "udp", "tls", "quic", "ws", "unixsock-stream")  # what the wheel is built with
-_SHM_MESSAGES = "transport/shared_memory/transport_optimization/messages"
+from potclient.zenoh_config import DEFAULT_ENDPOINT
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -39,61 +32,28 @@ class SessionOptions:
 def build_config(options: SessionOptions) -> zenoh.Config:
     """The Zenoh configuration of a client.
 
-    Unless a file or an override says otherwise: mode `client` (Zenoh no longer relays for peers that do not listen), no
-    multicast scouting, `DEFAULT_ENDPOINT`, and shared memory for puts only (clouds gain 4-8x from it; queries may be lost on it
-    when the receiver stalls).
+    Unless a file or an override says otherwise: mode `client` (Zenoh no longer relays for peers that do not listen),
+    `DEFAULT_ENDPOINT`, and what `zenoh_config.COMMON_DEFAULTS` says.
 
     Raises:
         UsageError: the file, a key or a value is not one that Zenoh takes.
     """
-    path = options.config_file or (
-        Path(os.environ["ZENOH_CONFIG"]) if os.environ.get("ZENOH_CONFIG") else None
+    waits = options.connect_timeout_s > 0
+    flags = {
+        "mode": options.mode,
+        "connect/endpoints": options.connect,
+        "listen/endpoints": options.listen,
+        "scouting/multicast/enabled": options.multicast_scouting,
+        "transport/shared_memory/enabled": options.shared_memory,
+        "connect/timeout_ms": round(options.connect_timeout_s * 1000) if waits else None,
+        "connect/exit_on_failure": True if waits else None,
+    }
+    return zenoh_config.build(
+        options.config_file,
+        {"mode": "client", "connect/endpoints": [DEFAULT_ENDPOINT]},
+        options.overrides,
+        flags,
     )
-    try:
-        config: zenoh.Config = zenoh.Config.from_file(path) if path else zenoh.Config()
-    except zenoh.ZError as error:
-        raise UsageError(f"Zenoh configuration {path}: {_first_line(error)}") from error
-    overridden = {key.strip("/") for key, _ in options.overrides}
-
-    def default(key: str, value: object, unset: tuple[str, ...] = ("null",)) -> None:
-        if key not in overridden and config.get_json(key) in unset:
-            config.insert_json5(key, json.dumps(value))
-
-    default("mode", "client")
-    default("scouting/multicast/enabled", False)
-    default("connect/endpoints", [DEFAULT_ENDPOINT], unset=("null", "[]"))
-    default(_SHM_MESSAGES, ["put"], unset=("null", '["put","query","reply"]'))
-    for key, value in options.overrides:
-        try:
-            _insert(config, key, value)
-        except zenoh.ZError as error:
-            raise UsageError(f"--cfg {key}:{value}: {_first_line(error)}") from error
-    for endpoint in (*options.connect, *options.listen):
-        protocol, slash, address = endpoint.partition("/")
-        if protocol not in _PROTOCOLS or not slash or not address:
-            raise UsageError(
-                f"endpoint {endpoint!r}: need PROTOCOL/ADDRESS, with {', '.join(_PROTOCOLS)}; e.g. {DEFAULT_ENDPOINT}"
-            )
-    flags: list[tuple[str, object]] = []  # they win over everything
-    if options.mode is not None:
-        flags.append(("mode", options.mode))
-    if options.connect:
-        flags.append(("connect/endpoints", list(options.connect)))
-    if options.listen:
-        flags.append(("listen/endpoints", list(options.listen)))
-    if options.multicast_scouting is not None:
-        flags.append(("scouting/multicast/enabled", options.multicast_scouting))
-    if options.shared_memory is not None:
-        flags.append(("transport/shared_memory/enabled", options.shared_memory))
-    if options.connect_timeout_s > 0:
-        flags.append(("connect/timeout_ms", round(options.connect_timeout_s * 1000)))
-        flags.append(("connect/exit_on_failure", True))
-    for key, flag in flags:
-        try:
-            config.insert_json5(key, json.dumps(flag))
-        except zenoh.ZError as error:
-            raise UsageError(f"{key} = {flag}: {_first_line(error)}") from error
-    return config
 
 
 def open_session(options: SessionOptions) -> zenoh.Session:
@@ -109,7 +69,7 @@ def open_session(options: SessionOptions) -> zenoh.Session:
     except zenoh.ZError as error:
         endpoints = json.loads(config.get_json("connect/endpoints") or "[]")
         where = ", ".join(str(e) for e in endpoints) or "any endpoint"
-        text = _first_line(error)
+        text = zenoh_config.reason_of(error)
         if "nable to connect" in text:
             waited = f" within {options.connect_timeout_s:g} s" if options.connect_timeout_s > 0 else ""
             raise NoServerError(
@@ -199,18 +159,3 @@ def parse_overrides(values: Sequence[str]) -> tuple[tuple[str, str], ...]:
             raise UsageError(f"--cfg {value!r}: need KEY:VALUE, e.g. transport/link/tx/lease:5000")
         pairs.append((key.strip(), json5.strip()))
     return tuple(pairs)
-
-
-def _insert(config: zenoh.Config, key: str, value: str) -> None:
-    """Set a JSON5 value; a word that is none is taken as a string, so that `mode:peer` works without quotes."""
-    try:
-        config.insert_json5(key, value)
-    except zenoh.ZError:
-        config.insert_json5(key, json.dumps(value))
-
-
-def _first_line(error: BaseException) -> str:
-    """Zenoh's message without its source location."""
-    text = str(error).split(" at /")[0].strip()
-    found = re.search(r'msg: "((?:[^"\\]|\\.)*)', text)
-    return (found.group(1) if found else text).strip().splitlines()[0]

@@ -1,7 +1,6 @@
 """Our Zenoh node: a peer with one loopback listener and no multicast, unless told otherwise.
 
-Precedence, weakest first: what is built in here, the Zenoh configuration file, `--cfg KEY:VALUE`, the flags
-`-m -e -l`.
+What is built in yields to the Zenoh configuration file, that to `--cfg KEY:VALUE`, and that to the flags `-m -e -l`.
 """
 
 from __future__ import annotations
@@ -9,21 +8,21 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import json
-import os
 import socket
 import threading
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Annotated, Any
 
 import zenoh
 
+from potclient import zenoh_config
+from potclient.errors import UsageError
+from potclient.zenoh_config import DEFAULT_ENDPOINT
 from potserver.errors import SettingsError
 from potserver.log import get_logger
 
 log = get_logger("potserver.session")
 
-DEFAULT_LISTEN = "tcp/127.0.0.1:7447"
 MAX_MESSAGE_BYTES = 64 * 2**20  # of one reassembled message; the library's default is 1 GiB
 _FREE_PORT_TRIES = 5
 
@@ -47,8 +46,7 @@ class ZenohSettings:
 def build_config(settings: ZenohSettings, *, root: str, wire_guard_bytes: int) -> zenoh.Config:
     """The Zenoh configuration of a server.
 
-    A built-in value holds where the file left the library's default in place; whatever the file says
-    otherwise wins.
+    A built-in value holds where the file leaves the library's own value.
 
     Args:
         settings: From the settings tree.
@@ -58,47 +56,36 @@ def build_config(settings: ZenohSettings, *, root: str, wire_guard_bytes: int) -
     Raises:
         SettingsError: the file cannot be read, or Zenoh refuses a key or value.
     """
-    untouched = zenoh.Config()
-    path = settings.config or os.environ.get("ZENOH_CONFIG")
-    config: zenoh.Config = zenoh.Config()
-    if path is not None:
-        if not Path(path).is_file():
-            raise SettingsError(f"no Zenoh configuration file {path}")
-        try:
-            config = zenoh.Config.from_file(path)
-        except zenoh.ZError as error:
-            raise SettingsError(f"{path} is not a Zenoh configuration: {_first_line(error)}") from error
-
-    for key, value in _built_in(root, wire_guard_bytes).items():
-        if config.get_json(key) == untouched.get_json(key):
-            _insert(config, key, value)
-    for key, value in settings.cfg.items():
-        _insert(config, key, value)
-    if settings.mode is not None:
-        _insert(config, "mode", settings.mode)
-    if settings.connect:
-        _insert(config, "connect/endpoints", list(settings.connect))
-    if settings.listen:
-        _insert(config, "listen/endpoints", list(settings.listen))
-    elif _mode(config) == "client" and config.get_json("listen/endpoints") == json.dumps([DEFAULT_LISTEN]):
-        _insert(config, "listen/endpoints", [])
-    if not settings.shared_memory:
-        _insert(config, "transport/shared_memory/enabled", False)
+    flags = {
+        "mode": settings.mode,
+        "connect/endpoints": settings.connect,
+        "listen/endpoints": settings.listen,
+        "transport/shared_memory/enabled": None if settings.shared_memory else False,
+    }
+    try:
+        config = zenoh_config.build(
+            settings.config,
+            _built_in(root, wire_guard_bytes),
+            settings.cfg.items(),
+            flags,
+        )
+    except UsageError as error:
+        raise SettingsError(str(error)) from error
+    listens_by_default = json.loads(config.get_json("listen/endpoints")) == [DEFAULT_ENDPOINT]
+    if _mode(config) == "client" and not settings.listen and listens_by_default:
+        config.insert_json5("listen/endpoints", "[]")
     if json.loads(config.get_json("transport/unicast/lowlatency")):
         # such a transport does not fragment: every message above 64 KiB would be lost
         raise SettingsError("transport/unicast/lowlatency loses every message above 64 KiB: leave it off")
     return config
 
 
-def _built_in(root: str, wire_guard_bytes: int) -> dict[str, Any]:
+def _built_in(root: str, wire_guard_bytes: int) -> dict[str, object]:
     return {
         "mode": "peer",
-        "listen/endpoints": [DEFAULT_LISTEN],
-        "scouting/multicast/enabled": False,
+        "listen/endpoints": [DEFAULT_ENDPOINT],
         "timestamping/enabled": True,
         "transport/link/rx/max_message_size": MAX_MESSAGE_BYTES,
-        # queries over shared memory can be lost when the receiver stalls; puts have receipts
-        "transport/shared_memory/transport_optimization/messages": ["put"],
         # shared memory does not heed max_message_size; this filter does its work there too
         "low_pass_filter": [
             {
@@ -125,7 +112,7 @@ def open_session(config: zenoh.Config) -> tuple[zenoh.Session, list[str]]:
     for attempt in range(1, tries + 1):
         endpoints = [_with_free_port(endpoint) for endpoint in wanted]
         if endpoints != wanted:
-            _insert(config, "listen/endpoints", endpoints)
+            config.insert_json5("listen/endpoints", json.dumps(endpoints))
         try:
             return zenoh.open(config), endpoints
         except zenoh.ZError as error:
@@ -151,19 +138,6 @@ def close_session(session: zenoh.Session, timeout_s: float) -> bool:
     if thread.is_alive():
         log.error("session_close_timed_out", timeout_s=timeout_s)
     return not thread.is_alive()
-
-
-def _insert(config: zenoh.Config, key: str, value: Any) -> None:
-    """Set one key; a string is tried as JSON5 first, so that `--cfg transport/link/tx/lease:5000` works."""
-    candidates = [value, json.dumps(value)] if isinstance(value, str) else [json.dumps(value)]
-    failure: Exception | None = None
-    for candidate in candidates:
-        try:
-            config.insert_json5(key, candidate)
-            return
-        except zenoh.ZError as error:
-            failure = error
-    raise SettingsError(f"Zenoh refuses {key} = {value!r}: {_first_line(failure)}") from failure
 
 
 def _mode(config: zenoh.Config) -> str:
@@ -204,9 +178,4 @@ def _explain(error: zenoh.ZError, endpoints: list[str]) -> str:
             " Hint: choose a port with --listen tcp/127.0.0.1:PORT, port 0 for any free one,"
             " or join the router with --connect and listen elsewhere"
         )
-    return f"cannot open Zenoh: {_first_line(error)}"
-
-
-def _first_line(error: Exception | None) -> str:
-    """Zenoh's reason without its source paths."""
-    return str(error).splitlines()[0].split(" at /", 1)[0][:300]
+    return f"cannot open Zenoh: {zenoh_config.reason_of(error)}"

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from potclient import cli as exporting
+from potclient.commands import export_flags, pose_flag
 from potclient.octomap import DEPTH, KEY_ORIGIN, Leaves, read_bt
 from potserver.commands.shared import EXIT_OK, add_group, add_settings_flags, add_verb, say, settings_of
 from potserver.errors import MapFileError, SettingsError
@@ -94,8 +94,8 @@ def add(commands: Any) -> None:
         epilog=_EXPORT_EXAMPLES,
     )  # fmt: skip
     export.add_argument("path", type=Path, metavar="FILE", help=_ONE_MAP)
-    export.add_argument("-f", "--format", dest="kind", choices=exporting.EXPORT_KINDS, required=True)
-    exporting.add_export_flags(export)
+    export.add_argument("-f", "--format", dest="kind", choices=export_flags.EXPORT_KINDS, required=True)
+    export_flags.add_export_flags(export)
 
     import_ = add_verb(
         verbs, "import", _import, help="a saved map of what another program, or an old store, knows", description=_IMPORT,
@@ -112,7 +112,7 @@ def add(commands: Any) -> None:
     )
     merge.add_argument("path", type=Path, metavar="FILE", help=_ONE_MAP)
     merge.add_argument("other", type=Path, metavar="OTHER", help="the one that is taken in")
-    exporting.add_pose_flag(merge)
+    pose_flag.add_pose_flag(merge)
 
     for writes in (import_, merge):
         writes.add_argument(
@@ -207,8 +207,8 @@ def _export(options: argparse.Namespace) -> int:
     from potserver.commands.unserved import UnservedMap
     from potserver.storage.map_file import read_map
 
-    exporting.check_export_flags(options)
-    return exporting.export_map(UnservedMap(read_map(_one_file(options.path))), options)
+    export_flags.check_export_flags(options)
+    return export_flags.export_map(UnservedMap(read_map(_one_file(options.path))), options)
 
 
 # --- import -----------------------------------------------------------------------------------------------------------
@@ -361,7 +361,7 @@ def _merge(options: argparse.Namespace) -> int:
     service = _service(dataclasses.replace(settings.mapping, tile_size_m=size_m), settings)
     service.restore(ours.state())
     say(f"merging {theirs.record.n_scans} scans into {ours.record.n_scans}: some seconds for a street")
-    pose = exporting.pose_of(*options.pose) if options.pose else np.eye(4)
+    pose = pose_flag.pose_of(*options.pose) if options.pose else np.eye(4)
     change = service.merge(theirs.state(), pose)
     stamps = dict(ours.record.stamps)
     for robot_id, stamp_ns in theirs.record.stamps.items():

@@ -88,12 +88,14 @@ def test_a_client_of_a_router_does_not_listen() -> None:
 
 def test_shared_memory_can_be_turned_off() -> None:
     assert get(build(shared_memory=False), "transport/shared_memory/enabled") is False
+    key = "transport/shared_memory/transport_optimization/messages"
+    assert get(build(cfg={key: ["put", "query"]}), key) == ["put", "query"]
 
 
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"cfg": {"no/such/key": "1"}}, "Zenoh refuses no/such/key = '1'"),
+        ({"cfg": {"no/such/key": "1"}}, "Zenoh refuses no/such/key = 1"),
         ({"cfg": {"mode": "broker"}}, "Zenoh refuses mode"),
         ({"config": "/no/such/file"}, "no Zenoh configuration file"),
         (

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 import zenoh
 
+from potclient import MapClient
 from potschemas import messages, wire
 from potschemas.answers import AnswerRule
 from potschemas.keys import MapKeys, stats_key
@@ -399,3 +400,31 @@ def real_client(real_server: MapServer) -> Iterator[Client]:
         client.one("integrate", make_cloud(robot="base"))
     yield client
     client.close()
+
+
+# --- a map behind a `MapClient` ------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="session")
+def map_server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[MapServer]:
+    """A server with the real mapper and a store, for tests that may change its map."""
+    settings = load_settings(
+        overrides={
+            "mapping.max_range_m": 12.0,
+            "mapping.beams_per_scan": 600,
+            "limits.max_query_points": 5000,
+            "store.directory": str(tmp_path_factory.mktemp("store")),
+            "store.fsync": False,
+        }
+    )
+    with MapServer(settings, listen="tcp/127.0.0.1:0") as server:
+        yield server
+
+
+@pytest.fixture
+def map_client(map_server: MapServer) -> Iterator[MapClient]:
+    """A client of `map_server`, whose map is empty."""
+    with MapClient(map_server.endpoint, timeout_s=DEADLINE_S) as client:
+        client.wait_ready()
+        client.control("clear")
+        yield client

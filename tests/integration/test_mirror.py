@@ -17,17 +17,17 @@ from potclient.cli import main
 from potclient.errors import NoServerError, UsageError
 from potschemas import messages, wire
 from potschemas.messages import ErrorCode
+from potserver.asking.tiles import Tiles
 from potserver.config import load_settings
 from potserver.server import MapServer
 
 from .conftest import Client, make_cloud, until
-from .fake_server import free_port
+from .scripted import free_port
 
 POINTS = np.random.default_rng(0).uniform([-8, -7, -2], [38, 7, 3], (400, 3))
 SETTINGS = {
     "mapping.max_range_m": 12.0,
     "mapping.beams_per_scan": 600,
-    "queries.tiles_part_kernels": 300,
 }
 
 
@@ -65,7 +65,10 @@ class Site:
 
 
 @pytest.fixture
-def site() -> Iterator[Site]:
+def site(monkeypatch: pytest.MonkeyPatch) -> Iterator[Site]:
+    monkeypatch.setitem(
+        Tiles.plan.__kwdefaults__, "part_kernels", 300
+    )  # so that updates come in several parts
     with ExitStack() as stack:
         yield Site(stack)
 

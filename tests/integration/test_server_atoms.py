@@ -179,15 +179,18 @@ def test_a_disk_that_refuses_leaves_the_dictionary_as_it_was(serve: Serve, site:
     assert names(client) == on_disk(site) == before
 
 
-def test_all_maps_of_a_server_share_the_dictionary(serve: Serve, site: Path) -> None:
-    client = serve(dictionary=str(site), maps=["one", "two"], map_id="one")
-    before = names(client)
-    client.remove_atom(before[0])
-    with MapClient(client._where, map="two", timeout_s=60.0) as other:
-        other.wait_ready()
+def test_all_maps_of_a_server_share_the_dictionary(site: Path) -> None:
+    settings = load_settings(overrides=FAST | {"dictionary": str(site), "maps": ["one", "two"]})
+    with (
+        MapServer(settings, listen="tcp/127.0.0.1:0") as server,
+        MapClient(server.endpoint, map="one", timeout_s=60.0) as client,
+        MapClient(server.endpoint, map="two", timeout_s=60.0) as other,
+    ):
+        before = names(client)
+        client.remove_atom(before[0])
         assert names(other) == before[1:]
         assert other.remove_atom(before[1]).n_atoms == 2
-    assert names(client) == before[2:]
+        assert names(client) == before[2:]
 
 
 def test_changes_while_clouds_come_in_lose_nothing(serve: Serve, site: Path) -> None:

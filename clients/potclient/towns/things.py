@@ -193,3 +193,7 @@ def cupboard(rng: np.random.Generator) -> list[Part]:
     """A cupboard or shelf along x with its back at y = 0."""
     wide, high = rng.uniform(0.8, 1.4), rng.choice((0.8, 1.9))
     return [box((-wide / 2, 0.0, 0.0), (wide / 2, 0.42, high), Kind.FURNITURE)]
+
+
+def street_tree(rng: np.random.Generator, low: float, high: float, thin: float, wide: float) -> list[Part]:
+    return tree(rng, 0.0, 0.0, height_m=rng.uniform(low, high), crown_m=rng.uniform(thin, wide))

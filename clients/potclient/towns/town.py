@@ -9,7 +9,8 @@ from numpy.typing import ArrayLike
 
 from potclient.errors import DatasetError
 from potclient.results import Bool, Float64, as_points
-from potclient.towns.blocks import EAST, NORTH, SOUTH, WEST, Block, Door, Name, Parked, build_block
+from potclient.towns.blocks import build_block
+from potclient.towns.site import EAST, NORTH, SOUTH, WEST, Block, Door, Name, Parked
 from potclient.towns.solids import Int64, Part, SolidSet
 from potclient.towns.streets import Crossing, StreetGrid, plan_drive, stream
 from potclient.towns.styles import style_named

@@ -1,0 +1,67 @@
+"""Checks of what callers pass in; what fails them is a `UsageError`, and nothing is sent."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, DTypeLike, NDArray
+
+from potclient.errors import UsageError
+from potclient.results import Float64
+from potschemas.keys import check_id
+from potschemas.messages import Unknown
+
+
+def legal_id(value: str, what: str) -> str:
+    """An id of a map, robot, server, verb or saved map."""
+    try:
+        return check_id(value, what)
+    except ValueError as error:
+        raise UsageError(str(error)) from error
+
+
+def numbers(value: ArrayLike, name: str, dtype: DTypeLike = np.float64) -> NDArray[Any]:
+    """An array of numbers, of any shape."""
+    try:
+        return np.asarray(value, dtype)
+    except (TypeError, ValueError) as error:
+        raise UsageError(f"{name}: not an array of numbers ({error})") from error
+
+
+def pose(value: ArrayLike, name: str = "T_map_sensor") -> Float64:
+    """(4, 4) float64. Whether it is rigid is left to the server."""
+    array = numbers(value, name)
+    if array.shape != (4, 4):
+        raise UsageError(f"{name}: shape {array.shape}, need (4, 4)")
+    return array
+
+
+def corner(value: ArrayLike, name: str) -> Float64:
+    """(3,) float64, m, map frame."""
+    array = numbers(value, name)
+    if array.shape != (3,) or not np.isfinite(array).all():
+        raise UsageError(f"{name}: need three finite numbers (x y z, m, map frame), not {value!r}")
+    return array
+
+
+def positive(value: float, name: str) -> float:
+    """A length, m."""
+    if not (math.isfinite(value) and value > 0):
+        raise UsageError(f"{name} is {value}, need a positive number of metres")
+    return float(value)
+
+
+def positive_or_none(value: float | None, name: str) -> float | None:
+    """A length, m, that the server chooses where it is None."""
+    return None if value is None else positive(value, name)
+
+
+def unknown_kind(value: Unknown | str) -> Unknown:
+    """What unobserved space is taken for."""
+    try:
+        return Unknown(value)
+    except ValueError as error:
+        names = ", ".join(kind.value for kind in Unknown)
+        raise UsageError(f"unknown space as {value!r}: need one of {names}") from error

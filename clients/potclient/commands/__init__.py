@@ -1,0 +1,1 @@
+"""The commands of `potclient`: a module a verb, each with `add(commands)` and `run(arguments)`."""

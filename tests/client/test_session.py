@@ -1,0 +1,88 @@
+"""The Zenoh configuration of a client: what is built in, and what wins over it. No session is opened."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+import zenoh
+
+from potclient.errors import UsageError
+from potclient.session import SessionOptions, add_zenoh_arguments, build_config, options_from_arguments
+from potclient.zenoh_config import DEFAULT_ENDPOINT
+
+
+def options_of(*words: str) -> SessionOptions:
+    parser = argparse.ArgumentParser()
+    add_zenoh_arguments(parser)
+    return options_from_arguments(parser.parse_args(words))
+
+
+def value(config: zenoh.Config, key: str) -> Any:
+    return json.loads(config.get_json(key))
+
+
+SHM_MESSAGES = "transport/shared_memory/transport_optimization/messages"
+
+
+def test_the_default_is_a_quiet_client(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("ZENOH_CONFIG", raising=False)
+    config = build_config(options_of())
+    assert value(config, "mode") == "client"
+    assert value(config, "connect/endpoints") == [DEFAULT_ENDPOINT]
+    assert value(config, "scouting/multicast/enabled") is False
+    assert value(config, SHM_MESSAGES) == ["put"]
+    assert value(config, "transport/shared_memory/enabled") is True
+
+
+def test_flags_win_over_cfg_and_cfg_over_the_file_and_the_file_over_ours(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    file = tmp_path / "z.json5"
+    file.write_text(
+        '{mode: "peer", connect: {endpoints: ["tcp/127.0.0.1:1"]}, scouting: {multicast: {enabled: true}}}'
+    )
+    for config in (
+        build_config(options_of("-c", str(file))),
+        build_config_with_environment(monkeypatch, file),
+    ):
+        assert value(config, "mode") == "peer"
+        assert value(config, "connect/endpoints") == ["tcp/127.0.0.1:1"]
+        assert value(config, "scouting/multicast/enabled") is True
+        assert value(config, SHM_MESSAGES) == ["put"], "what the file leaves open is ours"
+    config = build_config(
+        options_of(
+            *("-c", str(file), "--cfg", 'mode:"router"', "--cfg", f'{SHM_MESSAGES}:["put", "query"]'),
+            *("-e", "tcp/127.0.0.1:2", "-e", "tcp/127.0.0.1:3", "--no-multicast-scouting"),
+        )
+    )
+    assert value(config, "mode") == "router"
+    assert value(config, SHM_MESSAGES) == ["put", "query"]
+    assert value(config, "connect/endpoints") == ["tcp/127.0.0.1:2", "tcp/127.0.0.1:3"]
+    assert value(config, "scouting/multicast/enabled") is False
+    config = build_config(
+        options_of("--cfg", 'mode:"router"', "-m", "peer", "--no-shm", "-l", "tcp/127.0.0.1:0")
+    )
+    assert value(config, "mode") == "peer"
+    assert value(config, "transport/shared_memory/enabled") is False
+    assert value(config, "listen/endpoints") == ["tcp/127.0.0.1:0"]
+
+
+def test_a_word_in_cfg_needs_no_quotes() -> None:
+    assert value(build_config(options_of("--cfg", "mode:peer")), "mode") == "peer"
+
+
+def build_config_with_environment(monkeypatch: pytest.MonkeyPatch, file: Path) -> zenoh.Config:
+    monkeypatch.setenv("ZENOH_CONFIG", str(file))
+    config = build_config(options_of())
+    monkeypatch.delenv("ZENOH_CONFIG")
+    return config
+
+
+@pytest.mark.parametrize("endpoint", ["carrier-pigeon/127.0.0.1:1", "localhost:7447", "tcp/", ""])
+def test_endpoints_that_are_none_are_refused(endpoint: str) -> None:
+    with pytest.raises(UsageError, match="PROTOCOL/ADDRESS"):
+        build_config(SessionOptions(connect=(endpoint,)))
