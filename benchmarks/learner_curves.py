@@ -29,7 +29,7 @@ from potserver.atoms.build.scan_task import SectorOf, to_scan
 from potserver.atoms.learning import LearningSettings, beam_weights, cut_sectors, lattice, learn_kernels
 from potserver.domain.kernel_map import KernelMap
 from potserver.numerics.feature_blocks import feature_blocks
-from potserver.numerics.warm_fit import warm_fit
+from potserver.numerics.warm_fit import Prior, Solver, warm_fit
 
 _GRID_LENGTH = 0.75  # spacings
 _POINTS_PER_KERNEL = 4  # at least, for both: sectors with few points get fewer kernels
@@ -168,9 +168,8 @@ def _grid(sector: Sector, count: int, settings: LearningSettings) -> tuple[Score
     results = {}
     for prior_var in {settings.weight_var, *_FAVOURED_PRIORS}:
         solved = warm_fit(
-            blocks, occupied, beam_weights(occupied, settings.free_per_beam), zeros,
-            np.full(len(hinge), prior_var, np.float32), zeros,
-            n_newton=50, n_conjugate_gradient=200, least_curvature=1e-5,
+            blocks, occupied, beam_weights(occupied, settings.free_per_beam),
+            Prior(zeros, np.full(len(hinge), prior_var, np.float32)), zeros, Solver(50, 200, least_curvature=1e-5),
         )  # fmt: skip
         results[prior_var] = _scored(sector, hinge, gamma, solved.weights)
     return results[settings.weight_var], min(results.values(), key=lambda scores: scores.own.nll)

@@ -12,7 +12,7 @@ import numpy as np
 
 from potserver.domain.types import Atom, Bool, Float32, Float64, KernelSet, Scan
 from potserver.errors import EmptyError, SettingsError, ShapeError, SolverError
-from potserver.numerics.abhm import AbhmEpoch, AbhmPosterior, AbhmSettings, fit_abhm
+from potserver.numerics.abhm import AbhmEpoch, AbhmOptions, AbhmPosterior, AbhmStart, fit_abhm
 from potserver.numerics.beams import label_beams, limit_range
 from potserver.numerics.geometry import in_sector, rotation_z, sector_edges, thin, voxel_pick, yaw_of
 
@@ -35,7 +35,7 @@ class LearningSettings:
     min_hits: int = 40  # sectors with fewer make no atom
     max_kernels: int = 400  # of an atom
     points_per_kernel: int = 8  # at least; sectors with few points get fewer kernels
-    # of the ABHM; see numerics/abhm.py
+    # of the ABHM; see numerics/abhm
     weight_var: float = 200.0  # log-odds^2
     hinge_reach: float = 1.0
     gamma_shape: float = 2.0
@@ -69,12 +69,12 @@ class LearningSettings:
             raise SettingsError(str(error)) from error
 
     @property
-    def abhm(self) -> AbhmSettings:
+    def abhm(self) -> AbhmOptions:
         """What the numerics need of these."""
-        names = {f.name for f in dataclasses.fields(AbhmSettings)} & {
+        names = {f.name for f in dataclasses.fields(AbhmOptions)} & {
             f.name for f in dataclasses.fields(self)
         }
-        return AbhmSettings(**{name: getattr(self, name) for name in names})
+        return AbhmOptions(**{name: getattr(self, name) for name in names})
 
 
 class LabelledSector(NamedTuple):
@@ -216,7 +216,7 @@ def learn_kernels(
     n_kernels = max(1, min(settings.max_kernels, len(points) // settings.points_per_kernel))
     hinge, gamma = lattice(points, n_kernels)
     return fit_abhm(
-        points, occupied, hinge, gamma, settings.abhm,
+        points, occupied, AbhmStart(hinge, gamma), settings.abhm,
         sample_weight=beam_weights(occupied, settings.free_per_beam), seed=seed, threads=threads, on_epoch=on_epoch,
     )  # fmt: skip
 

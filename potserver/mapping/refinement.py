@@ -13,7 +13,7 @@ from potserver.domain.types import Bool, Float32, Float64, KernelSet
 from potserver.errors import SolverError
 from potserver.numerics.feature_blocks import feature_blocks
 from potserver.numerics.kernel_index import build_index, latent_sums
-from potserver.numerics.warm_fit import warm_fit
+from potserver.numerics.warm_fit import Prior, Solver, warm_fit
 
 _GAMMA_SHAPE = 100.0  # a placed kernel's width is known to 10 %
 
@@ -85,8 +85,8 @@ def refine(
     )  # fmt: skip
     counts = np.ones(len(points), np.float32) if sample_weight is None else sample_weight
     fit = warm_fit(
-        blocks, occupied, counts, kernels.weight_mean, kernels.weight_var, np.zeros_like(kernels.weight_mean),
-        n_newton=newton_steps, n_conjugate_gradient=gradient_steps, threads=threads,
+        blocks, occupied, counts, Prior(kernels.weight_mean, kernels.weight_var),
+        np.zeros_like(kernels.weight_mean), Solver(newton_steps, gradient_steps), threads=threads,
     )  # fmt: skip
     if not (np.isfinite(fit.weights).all() and np.isfinite(fit.var).all()):
         raise SolverError(

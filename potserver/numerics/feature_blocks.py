@@ -15,8 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potserver.numerics.cubes import sort_into_cubes
-from potserver.numerics.fastexp import FAST, exp32
-from potserver.numerics.kernel_index import _box, _gather, build_index
+from potserver.numerics.fastexp import exp32, inner_loop
+from potserver.numerics.gathering import kernels_that_reach
+from potserver.numerics.geometry import bounds
+from potserver.numerics.kernel_index import build_index
 from potserver.numerics.threads import parallel_map, spans
 
 Float32 = NDArray[np.float32]
@@ -92,9 +94,8 @@ def feature_blocks(
         return Block(
             inside,
             *_build(
-                grouped, inside, groups[span[0] : span[1] + 1] - groups[span[0]], index.hinge, index.columns,
-                index.order, index.level_start, index.level_edge, index.level_cell, index.level_size, index.keys, kind,
-                np.float32(1.0) / unit, np.float32(0.0 if exact else 0.5),
+                grouped, inside, groups[span[0] : span[1] + 1] - groups[span[0]], index, kind, np.float32(1.0) / unit,
+                np.float32(0.0 if exact else 0.5),
             ),
         )  # fmt: skip
 
@@ -105,7 +106,7 @@ def product(blocks: Blocks, weights: Float32, *, threads: int = 1) -> Float32:
     """(N,) Phi w, in the blocks' order."""
     out = np.zeros(len(blocks.order), np.float32)
     parallel_map(
-        lambda b: _product(b.cuts, b.kernels, b.starts, b.numbers, b.phi, blocks.unit, weights, out),
+        lambda b: _product(b, blocks.unit, weights, out),
         blocks.parts,
         threads,
     )
@@ -117,9 +118,7 @@ def gradient_and_diagonal(
 ) -> tuple[Float32, Float32]:
     """(K,) Phi^T r and (K,) diagonal of Phi^T diag(curvature) Phi, in one pass."""
     parts = parallel_map(
-        lambda b: _gradient(
-            b.cuts, b.kernels, b.starts, b.numbers, b.phi, blocks.unit, residual, curvature, blocks.n_kernels
-        ),
+        lambda b: _gradient(b, blocks.unit, residual, curvature, blocks.n_kernels),
         blocks.parts,
         threads,
     )
@@ -132,7 +131,7 @@ def gradient_and_diagonal(
 def normal_product(blocks: Blocks, curvature: Float32, direction: Float32, *, threads: int = 1) -> Float32:
     """(K,) Phi^T diag(curvature) Phi d, in one pass."""
     parts = parallel_map(
-        lambda b: _normal(b.cuts, b.kernels, b.starts, b.numbers, b.phi, blocks.unit, curvature, direction),
+        lambda b: _normal(b, blocks.unit, curvature, direction),
         blocks.parts,
         threads,
     )
@@ -141,7 +140,7 @@ def normal_product(blocks: Blocks, curvature: Float32, direction: Float32, *, th
 
 # The inner loops get their row as a slice: with an offset into the whole array the compiler must expect negative indices, and
 # makes no SIMD code.
-@nb.njit(nogil=True, fastmath=FAST, error_model="numpy", cache=True)
+@inner_loop
 def _phi_row(x, y, z, hx, hy, hz, minus_gamma, out):
     for i in range(len(out)):
         dx = x - hx[i]
@@ -150,44 +149,26 @@ def _phi_row(x, y, z, hx, hy, hz, minus_gamma, out):
         out[i] = exp32(minus_gamma[i] * (dx * dx + dy * dy + dz * dz))
 
 
-@nb.njit(nogil=True, fastmath=FAST, error_model="numpy", cache=True)
+@inner_loop
 def _store(row, scale, offset, out):
     for i in range(len(out)):
         out[i] = row[i] * scale + offset
 
 
 @nb.njit(nogil=True, error_model="numpy", cache=True)
-def _build(
-    points,
-    cuts,
-    groups,
-    hinge,
-    columns,
-    order,
-    level_start,
-    level_edge,
-    level_cell,
-    level_size,
-    keys,
-    kind,
-    scale,
-    offset,
-):
+def _build(points, cuts, groups, index, kind, scale, offset):
+    hinge, columns = index.hinge, index.columns
     n_cubes = len(cuts) - 1
     kernels = np.zeros(n_cubes + 1, np.int64)
     starts = np.zeros(n_cubes + 1, np.int64)
     reached = np.empty(64 * n_cubes + 4096, np.int64)
     found = np.empty(4096, np.int64)
     centre = np.empty((n_cubes, 3))
-    lower = np.empty(3)
-    upper = np.empty(3)
     near = np.empty((4, 4096), np.float32)
-    widest = 0
+    most = 0
     for g in range(len(groups) - 1):
-        _box(points, cuts[groups[g]], cuts[groups[g + 1]], lower, upper)
-        n_near, found = _gather(
-            lower, upper, hinge, columns, level_start, level_edge, level_cell, level_size, keys, found
-        )
+        lower, upper = bounds(points[cuts[groups[g]] : cuts[groups[g + 1]]])
+        n_near, found = kernels_that_reach(index, lower, upper, found)
         if n_near > near.shape[1]:
             near = np.empty((4, 2 * n_near), np.float32)
         gx, gy, gz = lower
@@ -199,7 +180,7 @@ def _build(
             near[3, i] = columns[3, m] * columns[3, m]
         for cube in range(groups[g], groups[g + 1]):
             a, b = cuts[cube], cuts[cube + 1]
-            _box(points, a, b, lower, upper)
+            lower, upper = bounds(points[a:b])
             first = kernels[cube]
             if first + n_near > len(reached):
                 more = np.empty(2 * (first + n_near), np.int64)
@@ -217,12 +198,12 @@ def _build(
                     n += 1
             for c in range(3):
                 centre[cube, c] = 0.5 * (lower[c] + upper[c])
-            widest = max(widest, n)
+            most = max(most, n)
             kernels[cube + 1] = first + n
             starts[cube + 1] = starts[cube] + (b - a) * n
     numbers = np.empty(kernels[-1], np.int32)
     phi = np.empty(starts[-1], kind.dtype)  # of the right size at once: it is large
-    local = np.empty((5, widest), np.float32)
+    local = np.empty((5, most), np.float32)
     for cube in range(n_cubes):
         first, at = kernels[cube], starts[cube]
         n = kernels[cube + 1] - first
@@ -233,7 +214,7 @@ def _build(
             local[1, i] = hinge[m, 1] - cy
             local[2, i] = hinge[m, 2] - cz
             local[3, i] = columns[0, m]
-            numbers[first + i] = order[m]
+            numbers[first + i] = index.order[m]
         for q in range(cuts[cube], cuts[cube + 1]):
             _phi_row(
                 np.float32(points[q, 0] - cx), np.float32(points[q, 1] - cy), np.float32(points[q, 2] - cz),
@@ -244,7 +225,7 @@ def _build(
     return kernels, starts, numbers, phi
 
 
-@nb.njit(nogil=True, fastmath=FAST, error_model="numpy", cache=True)
+@inner_loop
 def _dot(row, w):
     s = np.float32(0)
     for i in range(len(row)):
@@ -252,13 +233,13 @@ def _dot(row, w):
     return s
 
 
-@nb.njit(nogil=True, fastmath=FAST, error_model="numpy", cache=True)
+@inner_loop
 def _axpy(row, a, out):
     for i in range(len(row)):
         out[i] += a * np.float32(row[i])
 
 
-@nb.njit(nogil=True, fastmath=FAST, error_model="numpy", cache=True)
+@inner_loop
 def _axpy_both(row, a, b, out, squares):
     for i in range(len(row)):
         phi = np.float32(row[i])
@@ -267,16 +248,18 @@ def _axpy_both(row, a, b, out, squares):
 
 
 @nb.njit(nogil=True, error_model="numpy", cache=True)
-def _widest(kernels):
-    widest = 0
+def widest(kernels):
+    """The most kernels that reach one cube, from `Block.kernels`."""
+    most = 0
     for c in range(len(kernels) - 1):
-        widest = max(widest, kernels[c + 1] - kernels[c])
-    return widest
+        most = max(most, kernels[c + 1] - kernels[c])
+    return most
 
 
 @nb.njit(nogil=True, error_model="numpy", cache=True)
-def _product(cuts, kernels, starts, numbers, phi, unit, weights, out):
-    w = np.empty(_widest(kernels), np.float32)
+def _product(block, unit, weights, out):
+    cuts, kernels, starts, numbers, phi = block
+    w = np.empty(widest(kernels), np.float32)
     for c in range(len(cuts) - 1):
         first, at = kernels[c], starts[c]
         n = kernels[c + 1] - first
@@ -288,10 +271,10 @@ def _product(cuts, kernels, starts, numbers, phi, unit, weights, out):
 
 
 @nb.njit(nogil=True, error_model="numpy", cache=True)
-def _gradient(cuts, kernels, starts, numbers, phi, unit, residual, curvature, n_kernels):
+def _gradient(block, unit, residual, curvature, n_kernels):
+    cuts, kernels, starts, numbers, phi = block
     out = np.zeros((2, n_kernels), np.float32)
-    widest = _widest(kernels)
-    sums, squares = np.empty(widest, np.float32), np.empty(widest, np.float32)
+    sums, squares = np.empty(widest(kernels), np.float32), np.empty(widest(kernels), np.float32)
     for c in range(len(cuts) - 1):
         first, at = kernels[c], starts[c]
         n = kernels[c + 1] - first
@@ -308,10 +291,10 @@ def _gradient(cuts, kernels, starts, numbers, phi, unit, residual, curvature, n_
 
 
 @nb.njit(nogil=True, error_model="numpy", cache=True)
-def _normal(cuts, kernels, starts, numbers, phi, unit, curvature, direction):
+def _normal(block, unit, curvature, direction):
+    cuts, kernels, starts, numbers, phi = block
     out = np.zeros(len(direction), np.float32)
-    widest = _widest(kernels)
-    d, sums = np.empty(widest, np.float32), np.empty(widest, np.float32)
+    d, sums = np.empty(widest(kernels), np.float32), np.empty(widest(kernels), np.float32)
     for c in range(len(cuts) - 1):
         first, at = kernels[c], starts[c]
         n = kernels[c + 1] - first

@@ -13,6 +13,7 @@ large coordinates lose nothing in float32), and a dense SIMD loop runs over quer
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numba as nb
@@ -20,7 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potserver.numerics.cubes import sort_into_cubes
-from potserver.numerics.fastexp import FAST, exp32
+from potserver.numerics.fastexp import exp32, inner_loop
+from potserver.numerics.gathering import kernels_around
 from potserver.numerics.geometry import bounds, inside_box
 from potserver.numerics.threads import parallel_map, spans
 from potserver.numerics.voxel_hash import empty_table, enter
@@ -199,24 +201,39 @@ def latent_sums(index: KernelIndex, points: Float64, *, threads: int = 1, lane: 
         lane: See `threads.parallel_map`.
     Source: paper eq. 1; variance of a factorised posterior.
     """
+    return LatentSums(*sums_by_cube(_sum_cubes, 3, index, points, threads, lane))
+
+
+def sums_by_cube(
+    sum_cubes: Callable[[Float64, Int64, KernelIndex, Float32], None],
+    n_sums: int,
+    index: KernelIndex,
+    points: Float64,
+    threads: int,
+    lane: str,
+) -> Float32:
+    """(S, N) sums at N points, by a compiled loop over cubes of points.
+
+    Args:
+        sum_cubes: `f(points, cuts, index, out)` writes columns cuts[0] to cuts[-1] of `out`, (S, N); cube c is
+            points[cuts[c]:cuts[c + 1]].
+        n_sums: S.
+        index, points, threads, lane: See `latent_sums`.
+    """
     n = len(points)
-    out = np.zeros((3, n), np.float32)
+    out = np.zeros((n_sums, n), np.float32)
     if n == 0 or len(index.hinge) == 0:
-        return LatentSums(*out)
+        return out
     order, cuts = group_points(points, index.median_reach_m)
     grouped = points[order]
-    sums = np.zeros((3, n), np.float32)
-
-    def run(span: tuple[int, int]) -> None:
-        _sum_cubes(
-            grouped, cuts[span[0] : span[1] + 1], index.hinge, index.columns, index.level_start, index.level_edge,
-            index.level_cell, index.level_size, index.keys, sums,
-        )  # fmt: skip
-
+    sums = np.zeros((n_sums, n), np.float32)
     threads = threads if n >= _WORTH_THREADS else 1
-    parallel_map(run, spans(len(cuts) - 1, 4 * threads if threads > 1 else 1), threads, lane)
+    parallel_map(
+        lambda span: sum_cubes(grouped, cuts[span[0] : span[1] + 1], index, sums),
+        spans(len(cuts) - 1, 4 * threads if threads > 1 else 1), threads, lane,
+    )  # fmt: skip
     out[:, order] = sums
-    return LatentSums(*out)
+    return out
 
 
 class IndexParts(NamedTuple):
@@ -314,60 +331,7 @@ def _cut_sums(points, hinge, gamma, weight, variance, taus):
     return cut_mean, cut_var, total
 
 
-@nb.njit(nogil=True, error_model="numpy", cache=True)
-def _lower_bound(keys, low, high, key):
-    while low < high:
-        middle = (low + high) >> 1
-        if keys[middle] < key:
-            low = middle + 1
-        else:
-            high = middle
-    return low
-
-
-@nb.njit(nogil=True, error_model="numpy", cache=True)
-def _gather(
-    box_lower, box_upper, hinge, columns, level_start, level_edge, level_cell, level_size, keys, found
-):
-    """Numbers (in index order) of the kernels that reach the box; returns how many, and the buffer, grown if need be."""
-    n = 0
-    for level in range(len(level_edge)):
-        edge = level_edge[level]
-        first, last = level_start[level], level_start[level + 1]
-        nx, ny, nz = level_size[level]
-        x0 = max(int(np.floor(box_lower[0] / edge)) - 1 - level_cell[level, 0], 0)
-        y0 = max(int(np.floor(box_lower[1] / edge)) - 1 - level_cell[level, 1], 0)
-        z0 = max(int(np.floor(box_lower[2] / edge)) - 1 - level_cell[level, 2], 0)
-        x1 = min(int(np.floor(box_upper[0] / edge)) + 1 - level_cell[level, 0], nx - 1)
-        y1 = min(int(np.floor(box_upper[1] / edge)) + 1 - level_cell[level, 1], ny - 1)
-        z1 = min(int(np.floor(box_upper[2] / edge)) + 1 - level_cell[level, 2], nz - 1)
-        if x1 < x0 or y1 < y0 or z1 < z0:
-            continue
-        # a box over more rows of small cells than the level has kernels: one row that holds them all
-        whole = (y1 - y0 + 1) * (z1 - z0 + 1) > last - first
-        rows_z, rows_y = (1, 1) if whole else (z1 - z0 + 1, y1 - y0 + 1)
-        for z in range(z0, z0 + rows_z):
-            for y in range(y0, y0 + rows_y):
-                row = (z * ny + y) * nx
-                low = first if whole else _lower_bound(keys, first, last, row + x0)
-                for m in range(low, last):
-                    if not whole and keys[m] > row + x1:
-                        break
-                    d2 = 0.0
-                    for c in range(3):
-                        d = max(max(box_lower[c] - hinge[m, c], hinge[m, c] - box_upper[c]), 0.0)
-                        d2 += d * d
-                    if d2 <= columns[3, m] * columns[3, m]:
-                        if n == len(found):
-                            larger = np.empty(2 * n, np.int64)
-                            larger[:n] = found
-                            found = larger
-                        found[n] = m
-                        n += 1
-    return n, found
-
-
-@nb.njit(nogil=True, fastmath=FAST, error_model="numpy", cache=True)
+@inner_loop
 def _sum_point(x, y, z, hx, hy, hz, minus_gamma, w, v, n):
     mean = np.float32(0)
     var = np.float32(0)
@@ -384,47 +348,12 @@ def _sum_point(x, y, z, hx, hy, hz, minus_gamma, w, v, n):
 
 
 @nb.njit(nogil=True, error_model="numpy", cache=True)
-def _box(points, a, b, lower, upper):
-    for c in range(3):
-        lower[c] = points[a, c]
-        upper[c] = points[a, c]
-        for q in range(a + 1, b):
-            lower[c] = min(lower[c], points[q, c])
-            upper[c] = max(upper[c], points[q, c])
-
-
-@nb.njit(nogil=True, error_model="numpy", cache=True)
-def _about_middle(lower, upper, hinge, columns, found, n, local):
-    """The n found kernels in `local`, made longer if need be, with hinges relative to the middle of a box; and that middle."""
-    if n > local.shape[1]:
-        local = np.empty((6, 2 * n), np.float32)
-    cx = 0.5 * (lower[0] + upper[0])
-    cy = 0.5 * (lower[1] + upper[1])
-    cz = 0.5 * (lower[2] + upper[2])
-    for i in range(n):
-        m = found[i]
-        local[0, i] = hinge[m, 0] - cx
-        local[1, i] = hinge[m, 1] - cy
-        local[2, i] = hinge[m, 2] - cz
-        local[3, i] = columns[0, m]
-        local[4, i] = columns[1, m]
-        local[5, i] = columns[2, m]
-    return local, cx, cy, cz
-
-
-@nb.njit(nogil=True, error_model="numpy", cache=True)
-def _sum_cubes(points, cuts, hinge, columns, level_start, level_edge, level_cell, level_size, keys, sums):
+def _sum_cubes(points, cuts, index, sums):
     found = np.empty(4096, np.int64)
     local = np.empty((6, 4096), np.float32)
-    lower = np.empty(3)
-    upper = np.empty(3)
     for cube in range(len(cuts) - 1):
         a, b = cuts[cube], cuts[cube + 1]
-        _box(points, a, b, lower, upper)
-        n, found = _gather(
-            lower, upper, hinge, columns, level_start, level_edge, level_cell, level_size, keys, found
-        )
-        local, cx, cy, cz = _about_middle(lower, upper, hinge, columns, found, n, local)
+        n, found, local, cx, cy, cz = kernels_around(index, points[a:b], found, local)
         for q in range(a, b):
             sums[0, q], sums[1, q], sums[2, q] = _sum_point(
                 np.float32(points[q, 0] - cx), np.float32(points[q, 1] - cy), np.float32(points[q, 2] - cz),
