@@ -24,7 +24,7 @@ from potserver.domain.types import (
 )
 from potserver.errors import BadPointsError, OutOfRangeError, ShapeError, TooLargeError
 from potserver.mapping.service import MappingService
-from potserver.numerics.kernel_index import Int64
+from potserver.numerics.arrays import Int64
 from potserver.numerics.lattice import covered_cells, most_cells
 from potserver.numerics.rays import FirstReturns
 

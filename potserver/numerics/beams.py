@@ -6,10 +6,8 @@ from typing import NamedTuple
 
 import numba as nb
 import numpy as np
-from numpy.typing import NDArray
 
-Float64 = NDArray[np.float64]
-Bool = NDArray[np.bool_]
+from potserver.numerics.arrays import Bool, Float64, Int64
 
 
 class LabelledPoints(NamedTuple):
@@ -17,7 +15,7 @@ class LabelledPoints(NamedTuple):
 
     points: Float64  # (N, 3) m, in the frame of the beams
     occupied: Bool  # (N,) true = hit (y = 1), false = free (y = 0)
-    beam: NDArray[np.int64]  # (N,) number of the beam
+    beam: Int64  # (N,) number of the beam
 
 
 class Beams(NamedTuple):

@@ -12,15 +12,11 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from potserver.errors import EmptyError, ShapeError
-from potserver.numerics.sinkhorn import Ended, Workspace, solve_pairs
+from potserver.numerics.arrays import Bool, Float32, Int64
+from potserver.numerics.sinkhorn import Workspace, solve_pairs
 from potserver.numerics.threads import parallel_map
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
-Int64 = NDArray[np.int64]
 
 
 class Ragged(NamedTuple):
@@ -65,7 +61,13 @@ class CouplingCosts(NamedTuple):
     cost: Float32  # (P,) <P, D>, m^2: the squared 2-Wasserstein distance under the entropic plan
     marginal_error: Float32  # (P,) L1 distance of the column sums from 1/m (row sums are exact)
     n_iterations: Int64  # (P,)
-    converged: NDArray[np.bool_]  # (P,) marginal_error <= tolerance within max_iterations
+    converged: Bool  # (P,) marginal_error <= tolerance within max_iterations
+
+    @staticmethod
+    def room(n: int) -> CouplingCosts:
+        """Arrays for n problems, to be filled."""
+        cost, marginal_error = np.empty(n, np.float32), np.empty(n, np.float32)
+        return CouplingCosts(cost, marginal_error, np.empty(n, np.int64), np.empty(n, np.bool_))
 
 
 class Coupling(NamedTuple):
@@ -119,19 +121,19 @@ def coupling_costs(
     ):
         raise ShapeError(f"pairs names a set beyond {len(sources)} sources or {len(targets)} targets")
     n = len(pairs)
-    ended = Ended.of(n)
+    costs, regs = CouplingCosts.room(n), np.empty(n, np.float32)
 
     def run(start: int) -> None:
         solve_pairs(
             sources.points, sources.offsets, targets.points, targets.offsets, pairs, start, stride, np.float32(reg),
-            relative, np.float32(tolerance), max_iterations, Workspace.of(sources.largest, targets.largest), ended,
+            relative, np.float32(tolerance), max_iterations, Workspace.of(sources.largest, targets.largest), costs, regs,
         )  # fmt: skip
 
     stride = max(1, min(n, 8 * threads))
     parallel_map(run, range(stride if n else 0), threads)
     # checked again here: fast-math code may take a NaN for a number
-    finite = np.isfinite(ended.cost) & np.isfinite(ended.error)
-    return CouplingCosts(ended.cost, ended.error, ended.n_iterations, ended.converged & finite)
+    finite = np.isfinite(costs.cost) & np.isfinite(costs.marginal_error)
+    return costs._replace(converged=costs.converged & finite)
 
 
 def couple(
@@ -160,22 +162,22 @@ def couple(
     _check_reg(reg)
     x, y = Ragged.of([source]), Ragged.of([target])
     n, m = x.largest, y.largest
-    work, ended = Workspace.of(n, m), Ended.of(1)
+    work, costs, regs = Workspace.of(n, m), CouplingCosts.room(1), np.empty(1, np.float32)
     solve_pairs(
         x.points, x.offsets, y.points, y.offsets, np.zeros((1, 2), np.int64), 0, 1, np.float32(reg), relative,
-        np.float32(tolerance), max_iterations, work, ended,
+        np.float32(tolerance), max_iterations, work, costs, regs,
     )  # fmt: skip
-    plan, f, g, used = work.kernel.reshape(n, m), work.f, work.g, ended.reg[0]
+    plan, f, g = work.kernel.reshape(n, m), work.f, work.g
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):  # of a solve that failed
         plan *= work.u[:, None] / np.float32(n)
         plan *= work.v[None, :] / np.float32(m)
-        f += used * np.log(work.u)
-        g += used * np.log(work.v)
+        f += regs[0] * np.log(work.u)
+        g += regs[0] * np.log(work.v)
     # checked again here: fast-math code may take a NaN for a number
-    finite = all(bool(np.isfinite(a).all()) for a in (ended.cost, ended.error, f, g, plan))
+    finite = all(bool(np.isfinite(a).all()) for a in (costs.cost, costs.marginal_error, f, g, plan))
     return Coupling(
-        plan, float(ended.cost[0]), f, g, float(used), float(ended.error[0]), int(ended.n_iterations[0]),
-        bool(ended.converged[0]) and finite,
+        plan, float(costs.cost[0]), f, g, float(regs[0]), float(costs.marginal_error[0]),
+        int(costs.n_iterations[0]), bool(costs.converged[0]) and finite,
     )  # fmt: skip
 
 

@@ -12,12 +12,9 @@ from enum import Enum
 
 import numba as nb
 import numpy as np
-from numpy.typing import NDArray
 
+from potserver.numerics.arrays import Float32, Float64
 from potserver.numerics.coupling import Coupling
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
 
 
 class OutOfSample(str, Enum):

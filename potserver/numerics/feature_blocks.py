@@ -12,21 +12,14 @@ from typing import NamedTuple
 
 import numba as nb
 import numpy as np
-from numpy.typing import NDArray
 
+from potserver.numerics.arrays import Float32, Float64, Floats, Int32, Int64, UInt8
 from potserver.numerics.cubes import sort_into_cubes
 from potserver.numerics.fastexp import exp32, inner_loop
 from potserver.numerics.gathering import kernels_that_reach
 from potserver.numerics.geometry import bounds
 from potserver.numerics.kernel_index import build_index
 from potserver.numerics.threads import parallel_map, spans
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
-Int32 = NDArray[np.int32]
-Int64 = NDArray[np.int64]
-UInt8 = NDArray[np.uint8]
-Floats = NDArray[np.floating]
 
 _SPANS = 8  # of cubes; fixed, because sums over spans must not depend on the number of threads
 

@@ -9,9 +9,10 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from potserver.numerics.arrays import Float32, Float64
 from potserver.numerics.fastexp import exp32, inner_loop
 from potserver.numerics.gathering import kernels_around
-from potserver.numerics.kernel_index import Float32, Float64, KernelIndex, sums_by_cube
+from potserver.numerics.kernel_index import KernelIndex, sums_by_cube
 from potserver.numerics.occupancy import Float, predict_occupancy
 
 

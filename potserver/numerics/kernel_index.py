@@ -18,19 +18,14 @@ from typing import NamedTuple
 
 import numba as nb
 import numpy as np
-from numpy.typing import NDArray
 
+from potserver.numerics.arrays import Float32, Float64, Floats, Int64
 from potserver.numerics.cubes import sort_into_cubes
 from potserver.numerics.fastexp import exp32, inner_loop
 from potserver.numerics.gathering import kernels_around
 from potserver.numerics.geometry import bounds, inside_box
 from potserver.numerics.threads import parallel_map, spans
 from potserver.numerics.voxel_hash import empty_table, enter
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
-Int64 = NDArray[np.int64]
-Floats = NDArray[np.floating]
 
 _PROBABILITY_BUDGET = 4e-5  # of a probability, for all cut kernels together
 _TAUS = np.logspace(-3, -12, 10)

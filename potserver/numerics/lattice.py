@@ -5,7 +5,7 @@ from __future__ import annotations
 import numba as nb
 import numpy as np
 
-from potserver.numerics.kernel_index import Float64, Int64
+from potserver.numerics.arrays import Float64, Int64
 
 
 def most_cells(radii_m: Float64, edge_m: float, dims: int) -> float:

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import numba as nb
 import numpy as np
-from numpy.typing import NDArray
 
+from potserver.numerics.arrays import Float64
 from potserver.numerics.voxel_hash import empty_table, find, pack
-
-Float64 = NDArray[np.float64]
 
 
 def new_nodes(

@@ -21,9 +21,10 @@ from typing import NamedTuple, Protocol
 import numba as nb
 import numpy as np
 
+from potserver.numerics.arrays import Float64, Int64
 from potserver.numerics.fastexp import exp32, inner_loop
 from potserver.numerics.gathering import kernels_that_reach
-from potserver.numerics.kernel_index import Float64, Int64, KernelIndex
+from potserver.numerics.kernel_index import KernelIndex
 from potserver.numerics.threads import parallel_map, spans
 
 _END_OF_RAY = 1e-7  # survival below which a ray ends: the share by which a moment or a probability may be off

@@ -12,12 +12,9 @@ from typing import NamedTuple
 
 import numba as nb
 import numpy as np
-from numpy.typing import NDArray
 
+from potserver.numerics.arrays import Float32
 from potserver.numerics.fastexp import exp32, inner_loop
-
-Float32 = NDArray[np.float32]
-Int64 = NDArray[np.int64]
 
 _CHECK_EVERY = 5  # iterations between looks at the error
 _PLAIN_ITERATIONS = 15  # at the final level, before the contraction is measured
@@ -46,43 +43,26 @@ class Workspace(NamedTuple):
         return Workspace(*(np.empty(size, np.float32) for size in (n * m, n, n, m, m, m)))
 
 
-class Ended(NamedTuple):
-    """How each of P problems ended."""
-
-    cost: Float32  # (P,) <P, D>, m^2
-    error: Float32  # (P,) L1 distance of the plan's column sums from 1/m; row sums are exact
-    n_iterations: Int64  # (P,)
-    converged: NDArray[np.bool_]  # (P,)
-    reg: Float32  # (P,) m^2, the regularisation that was used
-
-    @staticmethod
-    def of(n: int) -> Ended:
-        """Room for n problems."""
-        return Ended(
-            np.empty(n, np.float32), np.empty(n, np.float32), np.empty(n, np.int64), np.empty(n, np.bool_),
-            np.empty(n, np.float32),
-        )  # fmt: skip
-
-
 # The one function that is called from Python: a second one would have its own copy of the loops, which may round otherwise.
 @nb.njit(nogil=True, error_model="numpy", cache=True)
 def solve_pairs(
-    xs, x_offsets, ys, y_offsets, pairs, start, stride, reg, relative, tol, max_iter, work, ended
+    xs, x_offsets, ys, y_offsets, pairs, start, stride, reg, relative, tol, max_iter, work, costs, regs
 ):
-    """Solve every `stride`-th problem from `start` on, and write how it ended.
+    """Solve every `stride`-th problem from `start` on, and write how each ended.
 
     Args:
         xs, x_offsets, ys, y_offsets: Sets of source and target points, see `coupling.Ragged`.
         pairs: (P, 2) numbers of the sets of each problem.
         reg, relative, tol, max_iter: See `coupling.coupling_costs`; reg and tol are float32.
         work: A Workspace that is large enough.
-        ended: An Ended for P problems.
+        costs: A `coupling.CouplingCosts` of P problems, to be filled.
+        regs: (P,) float32, to be filled: the regularisation that was used, m^2.
     """
     for p in range(start, len(pairs), stride):
         x = xs[x_offsets[pairs[p, 0]] : x_offsets[pairs[p, 0] + 1]]
         y = ys[y_offsets[pairs[p, 1]] : y_offsets[pairs[p, 1] + 1]]
         n, m = len(x), len(y)
-        ended.reg[p], ended.cost[p], ended.error[p], ended.n_iterations[p], ended.converged[p] = _solve(
+        regs[p], costs.cost[p], costs.marginal_error[p], costs.n_iterations[p], costs.converged[p] = _solve(
             x, y, reg, relative, tol, max_iter, work.kernel[: n * m].reshape(n, m), work.f[:n], work.g[:m],
             work.u[:n], work.v[:m], work.t[:m],
         )  # fmt: skip

@@ -8,10 +8,8 @@ from __future__ import annotations
 
 import numba as nb
 import numpy as np
-from numpy.typing import NDArray
 
-Int64 = NDArray[np.int64]
-Int32 = NDArray[np.int32]
+from potserver.numerics.arrays import Int32
 
 CELL_LIMIT = 2**19
 

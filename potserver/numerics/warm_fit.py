@@ -17,12 +17,9 @@ from typing import NamedTuple
 
 import numba as nb
 import numpy as np
-from numpy.typing import NDArray
 
+from potserver.numerics.arrays import Bool, Float32
 from potserver.numerics.feature_blocks import Blocks, gradient_and_diagonal, normal_product, product
-
-Float32 = NDArray[np.float32]
-Bool = NDArray[np.bool_]
 
 _SHRINK, _TRIALS = (
     0.25,

@@ -9,11 +9,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from potserver.errors import SolverError
 from potserver.numerics.abhm.means import Means, half_cosine
-from potserver.numerics.abhm.problem import Float64, KernelPrior, Problem, Weights
+from potserver.numerics.abhm.problem import KernelPrior, Problem, Weights
+from potserver.numerics.arrays import Float64, Int64
 
 _RATE = 0.1  # of Adam, in log standard deviations and log shapes
 _LEAST_GAMMA = 1e-20  # a sample of a wide Gamma may underflow
@@ -138,7 +138,7 @@ def log_likelihood(
     hinge: torch.Tensor,
     gamma: torch.Tensor,
     weight: torch.Tensor,
-    first: NDArray[np.int64],
+    first: Int64,
 ) -> torch.Tensor:
     """Log-likelihood of a batch times the number of batches, nats; see `Problem.log_likelihood`. Torch can differentiate it."""
     return _LogLikelihood.apply(problem, hinge, gamma, weight, first)

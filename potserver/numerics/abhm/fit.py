@@ -13,12 +13,10 @@ from potserver.numerics.abhm.means import AbhmEpoch, learn_means
 from potserver.numerics.abhm.problem import (
     AbhmOptions,
     AbhmStart,
-    Bool,
-    Float32,
-    Float64,
     KernelPrior,
     Problem,
 )
+from potserver.numerics.arrays import Bool, Float32, Float64
 
 
 class AbhmPosterior(NamedTuple):

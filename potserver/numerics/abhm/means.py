@@ -10,7 +10,8 @@ from typing import NamedTuple
 import numpy as np
 
 from potserver.errors import SolverError
-from potserver.numerics.abhm.problem import Float32, Float64, KernelPrior, Problem, Weights
+from potserver.numerics.abhm.problem import KernelPrior, Problem, Weights
+from potserver.numerics.arrays import Float32, Float64
 
 _COOLING, _COOLINGS = (
     0.4,

@@ -8,18 +8,14 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from potserver.errors import ShapeError
 from potserver.numerics.abhm import loops
+from potserver.numerics.arrays import Bool, Float32, Float64, Int64
 from potserver.numerics.feature_blocks import feature_blocks, gradient_and_diagonal, product
 from potserver.numerics.occupancy import sigmoid
 from potserver.numerics.threads import parallel_map
 from potserver.numerics.warm_fit import Prior, Solver, WarmFit, warm_fit
-
-Bool = NDArray[np.bool_]
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
 
 FEATURE_CUT = 3e-3  # activations below this are left out of an epoch
 _EDGE_IN_LENGTHS = 1.0  # edge of the cubes that share a list of kernels, in length scales
@@ -160,7 +156,7 @@ class Problem:
         var = 1.0 / (diagonal + np.float32(1.0 / self.options.weight_var))
         return Weights(solved.weights, var, solved.converged and solved.n_newton < _WHOLE.n_newton)
 
-    def batches(self, rng: np.random.Generator) -> Iterator[NDArray[np.int64]]:
+    def batches(self, rng: np.random.Generator) -> Iterator[Int64]:
         """Endless passes over the points: of each cube a step sees every `n_batches`-th one, in turn."""
         n_cubes = sum(len(part.cuts) - 1 for part in self.blocks.parts)
         while True:
@@ -169,7 +165,7 @@ class Problem:
                 yield (first + turn) % self.n_batches
 
     def log_likelihood(
-        self, hinge: Float32, gamma: Float32, weight: Float32, first: NDArray[np.int64]
+        self, hinge: Float32, gamma: Float32, weight: Float32, first: Int64
     ) -> tuple[float, Float32, Float32, Float32]:
         """Sum over the points of a batch times the number of batches, and its gradients; hinges relative to the corner."""
         kernels = np.concatenate([hinge.T, gamma[None], weight[None]])

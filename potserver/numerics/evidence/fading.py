@@ -12,8 +12,9 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from potserver.numerics.arrays import Bool, Float64, Int32, Int64
 from potserver.numerics.beams import Beams
-from potserver.numerics.evidence.rows import Bool, Float64, Int32, Int64, Rows, cells, is_alive, positions
+from potserver.numerics.evidence.rows import Rows, cells, is_alive, positions
 from potserver.numerics.geometry import bounds
 from potserver.numerics.threads import parallel_map, spans
 from potserver.numerics.voxel_hash import any_around, empty_table, find, pack

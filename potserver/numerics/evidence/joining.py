@@ -6,12 +6,10 @@ from typing import NamedTuple
 
 import numba as nb
 import numpy as np
-from numpy.typing import NDArray
 
-from potserver.numerics.evidence.rows import Bool, Float32, Float64, Rows, fill
+from potserver.numerics.arrays import Bool, Float32, Float64
+from potserver.numerics.evidence.rows import Rows, fill
 from potserver.numerics.voxel_hash import any_around, empty_table, enter, find, pack
-
-Int64 = NDArray[np.int64]
 
 TURNS = 3  # scans in which each old row is looked at once: a third of the old rows a scan keeps the cost low
 _LIGHT = 1.01  # looks: the most weight of a new row that may join another; its parts add up with rounding

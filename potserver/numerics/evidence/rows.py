@@ -16,14 +16,8 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from potserver.numerics.arrays import Bool, Float32, Float64, Int16, Int32, Int64
 from potserver.numerics.voxel_hash import empty_table, enter, find, pack
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
-Int16 = NDArray[np.int16]
-Int32 = NDArray[np.int32]
-Int64 = NDArray[np.int64]
-Bool = NDArray[np.bool_]
 
 _LEAST_WEIGHT = 1e-3  # a row with less is taken for empty
 _INSIDE = 0.5 - 1e-6  # voxels: how far from the centre a row may stand
