@@ -79,7 +79,7 @@ def _label(ends, is_return, length, usable, where, free_per_beam):
 def beam_weights(labelled: LabelledPoints) -> Float64:
     """(N,) how much each point counts: a beam's hit 1, and its free points 1 together.
 
-    So hits and free points weigh as beams see them, however many free points are drawn, and a fit needs no bias of its own.
+    A beam's hit and its free space then weigh the same, however many free points are drawn, and a fit needs no bias term.
     """
     free = ~labelled.occupied
     per_beam = np.bincount(labelled.beam[free], minlength=int(labelled.beam.max(initial=-1)) + 1)

@@ -2,7 +2,7 @@
 
     P* = argmin_P  <P, D> - reg * r(P),   D_ij = |x_i - y_j|^2,   rows of P sum to 1/n, columns to 1/m
 
-(the paper's lambda is 1/reg). `sinkhorn` solves them. A solve says how it ended; the caller decides what to do with one that
+(the paper's lambda is 1/reg). `sinkhorn` has the solver. A solve says how it ended; the caller decides what to do with one that
 did not converge.
 """
 

@@ -1,9 +1,9 @@
 """Dense blocks of features: rows are sorted into cubes, and each cube has phi of all its rows and all kernels that reach it.
 
-Against sparse rows a block has one list of kernels for all its rows, so products gather and scatter once a cube and run over
-dense memory; about half of what they touch is smaller than the cut, and still they are several times faster. Blocks are built
-anew for every solve: that costs less than keeping them right while rows move and kernels come. Products are bound by memory:
-blocks of one byte a value, off by at most 1/510, are more than twice as fast as those of four.
+All rows of a block share one list of kernels. So products gather and scatter once a cube and run over dense memory. About half
+of the values are smaller than the cut, and products are still several times faster than with sparse rows. Blocks are built anew
+for every solve, which costs less than updating them when rows move and kernels are added. Products are bound by memory: blocks
+of one byte a value, off by at most 1/510, are more than twice as fast as those of four bytes.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from potserver.numerics.geometry import bounds
 from potserver.numerics.kernel_index import build_index
 from potserver.numerics.threads import parallel_map, spans
 
-_SPANS = 8  # of cubes; fixed, because sums over spans must not depend on the number of threads
+_SPANS = 8  # of cubes; fixed, so that sums over spans do not depend on the number of threads
 
 
 class Block(NamedTuple):
@@ -131,7 +131,7 @@ def normal_product(blocks: Blocks, curvature: Float32, direction: Float32, *, th
     return np.sum(parts, axis=0, dtype=np.float32) if parts else np.zeros(blocks.n_kernels, np.float32)
 
 
-# The inner loops get their row as a slice: with an offset into the whole array the compiler must expect negative indices, and
+# Inner loops get their row as a slice. With an offset into the whole array the compiler has to allow for negative indices, and
 # makes no SIMD code.
 @inner_loop
 def _phi_row(x, y, z, hx, hy, hz, minus_gamma, out):

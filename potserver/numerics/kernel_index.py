@@ -3,11 +3,11 @@
     latent mean  sum_m w_m phi_m(x),   latent variance  sum_m v_m phi_m(x)^2,   activation  sum_m phi_m(x)
     phi_m(x) = exp(-gamma_m |x - h_m|^2)                                                        (paper eq. 1)
 
-A kernel's reach is where what it adds falls below a cut tau, which depends on its gamma, weight *and* variance. tau is
-chosen by measuring: at sample points, the absolute sum of everything cut must change the probability by less than a budget.
-Kernels are sorted into levels by reach (a factor of two each), every level into its own grid of cells, so wide and narrow
-ones cost alike. Queries are sorted into cubes; the kernels that reach a cube are gathered once, relative to its centre (so
-large coordinates lose nothing in float32), and a dense SIMD loop runs over queries times gathered kernels.
+A kernel reaches as far as what it adds is above a cut tau; that depends on its gamma, weight and variance. tau is found by
+measuring: at sample points, all that is cut together may change the probability by less than a budget. Kernels are sorted into
+levels by reach, a factor of two each, and every level into its own grid of cells, so that wide and narrow ones cost the same.
+Points are sorted into cubes. The kernels that reach a cube are gathered once (`gathering`), and a dense SIMD loop runs over
+points times kernels.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ from potserver.numerics.geometry import bounds, inside_box
 from potserver.numerics.threads import parallel_map, spans
 from potserver.numerics.voxel_hash import empty_table, enter
 
-_PROBABILITY_BUDGET = 4e-5  # of a probability, for all cut kernels together
-_TAUS = np.logspace(-3, -12, 10)
-_SAMPLES = 96
-_FRINGE = 25.0  # gamma d^2 out to which samples lie
-_STACK = 4.0  # kernels within a width of each other that are nothing special
-_TARGET_QUERIES_PER_CUBE = 24
-_PART_CUBE_M = 10.0  # a third of the edge within which points ask together
-_WORTH_THREADS = 4096  # points below which one thread is as fast as several
+_PROBABILITY_BUDGET = 4e-5  # by which all cut kernels together may change a probability
+_TAUS = np.logspace(-3, -12, 10)  # the cuts to choose from
+_SAMPLES = 96  # points at which cuts are measured
+_FRINGE = 25.0  # the largest gamma d^2 of a sample
+_STACK = 4.0  # kernels within a width of each other, from which on their reach grows
+_TARGET_QUERIES_PER_CUBE = 24  # points a cube, on average, at least
+_PART_CUBE_M = 10.0  # a third of the edge of the cubes whose points ask the parts of a map together
+_WORTH_THREADS = 4096  # points; with fewer one thread is as fast as several
 
 
 class KernelIndex(NamedTuple):
@@ -88,12 +88,12 @@ def choose_tau(hinge: Float64, gamma: Float64, weight: Float64, variance: Float6
 def stack_sizes(hinge: Float64, gamma: Float64) -> Float64:
     """(K,) about how many kernels of a kernel's own width lie within that width of it, itself included.
 
-    Many kernels on one spot (a robot that stands still, and maps that are concatenated) each fall below a cut that their sum
-    does not; a sample of the kernels need not meet such a stack.
+    Where many kernels lie on one spot (a robot that stands still, maps that are concatenated), each may fall below a cut while
+    their sum does not. The samples of `choose_tau` may miss such a stack.
     """
     level = np.rint(0.5 * np.log2(gamma))
     cell = np.floor(hinge * np.exp2(level)[:, None])
-    # cells are told apart by a mixed number, not by sorting rows: a rare collision only widens a reach
+    # one number a cell is faster than three; a rare collision widens a reach
     key = (cell @ np.array([1.0, 7919.0, 104729.0]) + 15485863.0 * level).astype(np.int64)
     return np.asarray(_times_there(key, empty_table(len(key))), np.float64)
 
@@ -130,7 +130,7 @@ def build_index(
         variance: (K,) log-odds^2, >= 0.
         activation_cut: phi below this is left out of the activation sum too.
         tau: The cut, if it is known already; measured otherwise.
-        guard_stacks: Let kernels that lie on one spot reach farther, because their sum falls below a cut later than each does.
+        guard_stacks: Let kernels reach farther where many lie on one spot, see `stack_sizes`.
     """
     hinge = np.ascontiguousarray(hinge, np.float64)
     gamma, weight, variance = (np.asarray(a, np.float64) for a in (gamma, weight, variance))
@@ -140,7 +140,7 @@ def build_index(
     if guard_stacks:
         exponent += np.log(np.maximum(stack_sizes(hinge, gamma) / _STACK, 1.0))
     r = np.sqrt(exponent / gamma)
-    # levels halve the reach; a floor keeps one tiny kernel from making a level of its own
+    # each level has half the reach of the one above; all kernels of tiny reach share the last one
     top = float(r.max(initial=1e-3))
     level = np.clip(np.ceil(np.log2(np.maximum(r, 1e-6) / top)).astype(np.int64), -12, 0)
     used = np.unique(level)[::-1]
@@ -249,7 +249,7 @@ class IndexParts(NamedTuple):
 def latent_sums_of_parts(
     parts: IndexParts, points: Float64, *, threads: int = 1, lane: str = "map"
 ) -> LatentSums:
-    """`latent_sums` over all parts of a map. Points near each other ask together, and only the parts that reach them."""
+    """`latent_sums` over all parts of a map. Points near each other ask together, and they ask only parts that reach them."""
     if len(parts.indices) == 1:
         return latent_sums(parts.indices[0], points, threads=threads, lane=lane)
     total = LatentSums(*np.zeros((3, len(points)), np.float32))

@@ -180,6 +180,7 @@ def _conjugate_gradient(apply, rhs: Float32, diagonal: Float32, n_steps: int) ->
 
 @nb.njit(nogil=True, error_model="numpy", cache=True)
 def _terms(f, y, c, least):
+    """(N,) first derivative of each row's loss in f, and (N,) a curvature with which no step overshoots."""
     residual = np.empty(len(f), np.float32)
     curvature = np.empty(len(f), np.float32)
     one, half = np.float32(1), np.float32(0.5)
@@ -197,6 +198,7 @@ def _terms(f, y, c, least):
 
 @nb.njit(nogil=True, error_model="numpy", cache=True)
 def _loss(f, change, size, y, c):
+    """Sum of the rows' losses at f + size * change, nats."""
     total = 0.0
     for i in range(len(f)):
         x = f[i] + size * change[i]

@@ -12,8 +12,7 @@ import numpy as np
 import pytest
 
 from potserver.domain.types import AnswerRule
-from potserver.numerics.abhm import AbhmOptions
-from potserver.numerics.abhm.problem import Problem
+from potserver.numerics.abhm import loops
 from potserver.numerics.coupling import CouplingCosts, Ragged, couple, coupling_costs
 from potserver.numerics.feature_blocks import (
     Blocks,
@@ -140,20 +139,18 @@ def test_couplings_whichever_way_their_workspace_lies(n: int, m: int) -> None:
     assert results[0][3].all()
 
 
-def test_the_learners_sums_whatever_else_is_in_memory() -> None:
-    rng = np.random.default_rng(0)
-    points, occupied = rng.uniform(-3, 3, (400, 3)), rng.random(400) < 0.4
-    hinge, gamma = rng.uniform(-3, 3, (60, 3)), np.full(60, 0.5)
-    problem = Problem(points, occupied, np.ones(400, np.float32), AbhmOptions(batch=400), threads=1)
-    problem.gather(hinge, gamma)
-    n_cubes = sum(len(part.cuts) - 1 for part in problem.blocks.parts)
-    at = [a.astype(np.float32) for a in (hinge - problem.corner, gamma, rng.normal(size=60))]
-    results, others = [], []
-    for offset in itertools.islice(itertools.cycle(OFFSETS), 12):
-        others.append(np.empty(int(rng.integers(1, 500)), np.float32))
-        arguments = [_placed(a, offset) for a in at]
-        _, *gradients = problem.log_likelihood(*arguments, np.zeros(n_cubes, np.int64))
-        results.append((*gradients, *problem.curvatures(*arguments)))
+@pytest.mark.parametrize("n", [7, 20, 61, 200])
+def test_the_learners_latent_whichever_way_its_arrays_lie(n: int) -> None:
+    kernels = np.random.default_rng(0).normal(size=(5, n)).astype(np.float32)
+    results = []
+    for order in itertools.islice(itertools.permutations(range(7)), 0, None, 200):
+        for gap in (0, 5):
+            memory = np.zeros((7, n + gap), np.float32)
+            parts = {part: memory[row, :n] for row, part in enumerate(order)}
+            for part, values in enumerate(kernels):
+                parts[part][:] = np.abs(values) if part == 3 else values  # the gammas are positive
+            at = (np.float32(0.1), np.float32(-0.2), np.float32(0.3))
+            results.append((np.asarray(loops.latent(*at, *(parts[i] for i in range(7)))), parts[5].copy()))
     _same(results)
 
 

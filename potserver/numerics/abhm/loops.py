@@ -15,7 +15,8 @@ from potserver.numerics.feature_blocks import widest
 
 # The inner loops get slices, so that the compiler makes SIMD code of them; see feature_blocks.py.
 @inner_loop
-def _forward(x, y, z, hx, hy, hz, g, w, phi, d2):
+def latent(x, y, z, hx, hy, hz, g, w, phi, d2):
+    """f at one point. What the gradient needs as well is written to `phi` and `d2`, (K,): activations and squared distances."""
     for i in range(len(phi)):
         dx, dy, dz = x - hx[i], y - hy[i], z - hz[i]
         q = dx * dx + dy * dy + dz * dz
@@ -29,7 +30,8 @@ def _forward(x, y, z, hx, hy, hz, g, w, phi, d2):
 
 
 @inner_loop
-def _backward(residual, x, y, z, hx, hy, hz, g, w, phi, d2, by_x, by_y, by_z, by_g, by_w):
+def _add_gradient(residual, x, y, z, hx, hy, hz, g, w, phi, d2, by_x, by_y, by_z, by_g, by_w):
+    """Add one point's gradient to those by hinges, gammas and weights."""
     for i in range(len(phi)):
         t = residual * phi[i]
         by_w[i] += t
@@ -70,14 +72,14 @@ def gradient(x, occupied, count, block, columns, first, stride, negligible):
         hx, hy, hz, g, w = near[0, :n], near[1, :n], near[2, :n], near[3, :n], near[4, :n]
         phi, d2 = phi_of[:n], d2_of[:n]
         for r in range(cuts[c] + first[c], cuts[c + 1], stride):
-            f = _forward(x[0, r], x[1, r], x[2, r], hx, hy, hz, g, w, phi, d2)
+            f = latent(x[0, r], x[1, r], x[2, r], hx, hy, hz, g, w, phi, d2)
             margin = f if occupied[r] else -f
             small = exp32(-abs(margin))
             total += count[r] * (min(margin, np.float32(0)) - np.log1p(small))
             wrong = small / (np.float32(1) + small) if margin > 0 else np.float32(1) / (np.float32(1) + small)
             residual = count[r] * (wrong if occupied[r] else -wrong)
             if abs(residual) >= negligible:
-                _backward(
+                _add_gradient(
                     residual, x[0, r], x[1, r], x[2, r], hx, hy, hz, g, w, phi, d2,
                     by[0, :n], by[1, :n], by[2, :n], by[3, :n], by[4, :n],
                 )  # fmt: skip
@@ -105,7 +107,7 @@ def curvatures(x, count, block, columns):
                 near[row, i] = columns[row, numbers[at + i]]
         phi, d2 = np.empty(n, np.float32), np.empty(n, np.float32)
         for r in range(cuts[c], cuts[c + 1]):
-            f = _forward(x[0, r], x[1, r], x[2, r], near[0], near[1], near[2], near[3], near[4], phi, d2)
+            f = latent(x[0, r], x[1, r], x[2, r], near[0], near[1], near[2], near[3], near[4], phi, d2)
             small = exp32(-abs(f))
             curvature = count[r] * small / np.square(np.float32(1) + small)
             for i in range(n):
