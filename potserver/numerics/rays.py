@@ -28,9 +28,8 @@ from potserver.numerics.kernel_index import KernelIndex
 from potserver.numerics.threads import parallel_map, spans
 
 _END_OF_RAY = 1e-7  # survival below which a ray ends: the share by which a moment or a probability may be off
-_BLOCK_REACHES = (
-    3.0  # length of the stretch of a ray that shares a list of kernels, in reaches of a kernel; measured
-)
+# Length of the stretch of a ray that shares a list of kernels, in reaches of a kernel; measured.
+_BLOCK_REACHES = 3.0
 _BLOCK_STEPS = (4, 128)  # the least and the most steps of such a stretch
 _WIDTH_OF_NOTHING_M = 1.0  # width in a map without kernels
 

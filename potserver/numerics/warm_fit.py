@@ -21,10 +21,8 @@ import numpy as np
 from potserver.numerics.arrays import Bool, Float32
 from potserver.numerics.feature_blocks import Blocks, gradient_and_diagonal, normal_product, product
 
-_SHRINK, _TRIALS = (
-    0.25,
-    12,
-)  # of the line search: the factor by which it shortens a step, and how often at most
+_SHRINK = 0.25  # by which the line search shortens a step that is too long
+_TRIALS = 12  # of the line search, at most
 _ENOUGH = 1e-5  # relative gain of the objective below which steps end
 
 

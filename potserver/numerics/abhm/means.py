@@ -13,10 +13,8 @@ from potserver.errors import SolverError
 from potserver.numerics.abhm.problem import KernelPrior, Problem, Weights
 from potserver.numerics.arrays import Float32, Float64
 
-_COOLING, _COOLINGS = (
-    0.4,
-    2,
-)  # factor of the step size after an epoch without a gain, and how often at most; then it ends
+_COOLING = 0.4  # factor of the step size after an epoch without a gain
+_COOLINGS = 2  # such epochs; one more ends the means
 
 
 class AbhmEpoch(NamedTuple):

@@ -34,20 +34,14 @@ class AbhmOptions:
     """
 
     weight_var: float = 200.0  # log-odds^2, prior variance of a weight: a standard deviation of 14
-    hinge_reach: float = (
-        1.0  # prior standard deviation of a hinge about its start, in the length scale it starts with
-    )
-    gamma_shape: float = (
-        2.0  # shape of the Gamma prior of a gamma, whose mean is the start: it spreads by 70 %
-    )
+    hinge_reach: float = 1.0  # prior standard deviation of a hinge about its start, in length scales
+    gamma_shape: float = 2.0  # of a gamma's prior, whose mean is the start: it spreads by 70 %
     max_epochs: int = 10  # of the means, at most
     dispersion_epochs: int = 4
     steps: int = 60  # gradient steps an epoch
     batch: int = 2_000  # points a step, about
-    learning_rate: float = (
-        0.1  # of hinges, in length scales, and of log gamma, a step; falls along a half cosine
-    )
-    tolerance: float = 2e-3  # share of the objective that an epoch of the means must gain; negative: none
+    learning_rate: float = 0.1  # the first step size, of hinges in length scales and of log gammas
+    tolerance: float = 2e-3  # share of the objective that an epoch of the means should gain; negative: any
 
     def __post_init__(self) -> None:
         for name in ("weight_var", "hinge_reach", "gamma_shape", "learning_rate"):

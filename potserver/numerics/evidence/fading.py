@@ -21,14 +21,10 @@ from potserver.numerics.voxel_hash import any_around, empty_table, find, pack
 
 _BEHIND = 2.0  # resolutions that a beam must go on behind a hit to have passed through it; less is a graze, or noise
 _AROUND = 2  # voxels of hits to each side of a hit: where passing beams and voxels are counted
-_DOUBTED, _SURE = (
-    8.0,
-    20.0,
-)  # beams more than voxels: up to the first nothing fades, from the second on it fades in full
-_FREE_A_HIT, _FREE_ALONE = (
-    2.0,
-    100.0,
-)  # free weight for each weight of hits, and for each place, at a rate of 1
+_DOUBTED = 8.0  # beams more than voxels up to which nothing fades
+_SURE = 20.0  # the same, from which on hits fade in full
+_FREE_A_HIT = 2.0  # free weight that comes for each weight of hits, at a rate of 1
+_FREE_ALONE = 100.0  # the same, for each place
 _OUTVOTED = 3.0  # free weight in a cell, in weights of its hits, beyond which no more is added
 _WALK = 0.75  # step of a walk along a beam, in voxels of hits
 _BLOCK_SHIFT, _MAX_BLOCKS = 1, 2**22  # blocks of 2^shift voxels of hits along an edge

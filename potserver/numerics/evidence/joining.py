@@ -24,7 +24,7 @@ _WIDE_CLEAR = 3  # the same, to join a row two voxels away
 
 
 class Joined(NamedTuple):
-    """Rows after samples were added and light rows have joined others."""
+    """Rows after samples were added and light rows joined others."""
 
     rows: Rows  # those that are left of the old ones first, in their order
     weight: Float32  # (R,) what each row gained by the samples, with what joined it
@@ -67,12 +67,11 @@ def add_sparing(
     added = fill(rows, points, occupied, weight, fine_m, source)
     n_before = len(rows.occupied)
     left = np.ones(len(added.weight), bool)
-    # voxels of free space whose neighbours are in the box too: of an empty box none
+    # voxels of free space whose neighbours are in the box too; an empty box has none
     lower, upper = (np.zeros(3), np.zeros(3)) if within is None else within
     first, last = np.floor(lower / fine_m).astype(np.int64) + 1, np.floor(upper / fine_m).astype(np.int64) - 1
-    part = (
-        turn + turn // TURNS
-    ) % TURNS  # a source that has every second or third turn gets to all parts, too
+    # the part shifts with every round, so that a source that has every third turn gets to all parts too
+    part = (turn + turn // TURNS) % TURNS
     _join_light(
         added.rows, added.weight, left, n_before, source, fine_m, first, last, part, added.table, added.keys,
         empty_table(len(added.keys)),
