@@ -16,7 +16,7 @@ from potserver.numerics.coupling import Ragged, couple, coupling_costs
 from potserver.numerics.feature_blocks import feature_blocks
 from potserver.numerics.geometry import rotation_z
 from potserver.numerics.threads import default_threads
-from potserver.numerics.warm_fit import warm_fit
+from potserver.numerics.warm_fit import Prior, Solver, warm_fit
 
 THREADS = (1, default_threads())
 
@@ -126,9 +126,7 @@ def test_refinement(benchmark: Any, threads: int) -> None:
         blocks = feature_blocks(points, hinge, gamma, edge_m=1.0, cut=0.02, bytes_a_value=1, threads=threads)
         zeros, prior = np.zeros(len(hinge), np.float32), np.full(len(hinge), 50.0, np.float32)
         counts = np.ones(len(points), np.float32)
-        return warm_fit(
-            blocks, labels, counts, zeros, prior, zeros, n_newton=4, n_conjugate_gradient=8, threads=threads
-        )
+        return warm_fit(blocks, labels, counts, Prior(zeros, prior), zeros, Solver(4, 8), threads=threads)
 
     assert benchmark(solve).converged
     benchmark.extra_info.update(points=len(points), kernels=len(hinge), threads=threads)

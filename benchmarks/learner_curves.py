@@ -32,7 +32,7 @@ from potserver.atoms.learning import LearningSettings, beam_weights, cut_sectors
 from potserver.commands.shared import table
 from potserver.domain.kernel_map import KernelMap
 from potserver.numerics.feature_blocks import feature_blocks
-from potserver.numerics.warm_fit import warm_fit
+from potserver.numerics.warm_fit import Prior, Solver, warm_fit
 from potserver.recordings import to_scan
 
 _GRID_LENGTH = 0.75  # spacings
@@ -164,9 +164,8 @@ def _grid(sector: Sector, count: int, settings: LearningSettings) -> tuple[Score
     results = {}
     for prior_var in {settings.weight_var, *_FAVOURED_PRIORS}:
         solved = warm_fit(
-            blocks, occupied, beam_weights(occupied, settings.free_per_beam), zeros,
-            np.full(len(hinge), prior_var, np.float32), zeros,
-            n_newton=50, n_conjugate_gradient=200, least_curvature=1e-5,
+            blocks, occupied, beam_weights(occupied, settings.free_per_beam),
+            Prior(zeros, np.full(len(hinge), prior_var, np.float32)), zeros, Solver(50, 200, least_curvature=1e-5),
         )  # fmt: skip
         results[prior_var] = _scored(sector, hinge, gamma, solved.weights)
     return results[settings.weight_var], min(results.values(), key=lambda scores: scores.own.nll)

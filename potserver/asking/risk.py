@@ -15,7 +15,7 @@ from potserver.domain.kernel_map import KernelMap
 from potserver.domain.types import Bool, Float64, Unknown, check_rigid
 from potserver.errors import BadPointsError, ShapeError, TooLargeError
 from potserver.limits import Limits
-from potserver.numerics.kernel_index import Int64
+from potserver.numerics.arrays import Int64
 from potserver.numerics.lattice import covered_cells, most_cells
 
 PART_CELLS = 50_000  # of a part: some tens of milliseconds of work

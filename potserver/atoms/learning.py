@@ -12,7 +12,7 @@ import numpy as np
 from potserver.domain.types import Atom, Bool, Float32, Float64, KernelSet, Scan
 from potserver.errors import EmptyError, SettingsError, ShapeError, SolverError
 from potserver.mapping.sectors import SectorCut, sector_frames
-from potserver.numerics.abhm import AbhmEpoch, AbhmPosterior, AbhmSettings, fit_abhm
+from potserver.numerics.abhm import AbhmEpoch, AbhmOptions, AbhmPosterior, AbhmStart, fit_abhm
 from potserver.numerics.beams import label_beams, limit_range
 from potserver.numerics.geometry import thin, voxel_pick
 
@@ -35,7 +35,7 @@ class LearningSettings:
     min_hits: int = 40  # sectors with fewer make no atom
     max_kernels: int = 400  # of an atom
     points_per_kernel: int = 8  # at least; sectors with few points get fewer kernels
-    # of the ABHM; see numerics/abhm.py
+    # of the ABHM; see numerics/abhm
     weight_var: float = 200.0  # log-odds^2
     hinge_reach: float = 1.0
     gamma_shape: float = 2.0
@@ -68,10 +68,10 @@ class LearningSettings:
             raise SettingsError(str(error)) from error
 
     @property
-    def abhm(self) -> AbhmSettings:
+    def abhm(self) -> AbhmOptions:
         """What the numerics need of these."""
-        own, wanted = ({f.name for f in dataclasses.fields(kind)} for kind in (self, AbhmSettings))
-        return AbhmSettings(**{name: getattr(self, name) for name in own & wanted})
+        own, wanted = ({f.name for f in dataclasses.fields(kind)} for kind in (self, AbhmOptions))
+        return AbhmOptions(**{name: getattr(self, name) for name in own & wanted})
 
 
 class LabelledSector(NamedTuple):
@@ -213,7 +213,7 @@ def learn_kernels(
     n_kernels = max(1, min(settings.max_kernels, len(points) // settings.points_per_kernel))
     hinge, gamma = lattice(points, n_kernels)
     return fit_abhm(
-        points, occupied, hinge, gamma, settings.abhm,
+        points, occupied, AbhmStart(hinge, gamma), settings.abhm,
         sample_weight=beam_weights(occupied, settings.free_per_beam), seed=seed, threads=threads, on_epoch=on_epoch,
     )  # fmt: skip
 

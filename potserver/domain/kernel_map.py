@@ -164,18 +164,9 @@ class KernelMap:
             Unknown.PRIOR: math.log(2.0) / width_of_unknown,
             Unknown.OCCUPIED: math.inf,
         }
-        return rays.first_returns(
-            self._whole,
-            origins,
-            directions,
-            max_range_m,
-            step_m=step_m,
-            quantiles=quantiles,
-            unknown_rate=rate[unknown],
-            width_m=width_m,
-            rule=self.rule,
-            threads=self._threads,
-        )
+        options = rays.RayOptions(step_m, quantiles, rate[unknown], width_m)
+        looks = rays.Rays(origins, directions, max_range_m)
+        return rays.first_returns(self._whole, looks, options, self.rule, threads=self._threads)
 
     @cached_property
     def _whole(self) -> kernel_index.KernelIndex:

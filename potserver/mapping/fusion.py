@@ -35,7 +35,7 @@ from potserver.numerics.beams import Beams, LabelledPoints, beam_weights
 from potserver.numerics.feature_blocks import feature_blocks, gradient_and_diagonal
 from potserver.numerics.geometry import bounds, inside_box
 from potserver.numerics.lattice_nodes import new_nodes
-from potserver.numerics.warm_fit import warm_fit
+from potserver.numerics.warm_fit import Prior, Solver, warm_fit
 
 _FINEST_M, _COARSEST_M, _FINE_PER_RANGE = 0.2, 0.4, 1.0 / 20.0
 _COARSE_REACH = 1.0  # spacings: nearer coarse nodes than this get a kernel, see lattice_nodes.new_nodes
@@ -189,8 +189,8 @@ def _samples_of(look: Look, region: Region, options: FusionOptions, threads: int
         return Samples(points, occupied, weight)
     start = look.origin - region.origin_m
     seen = evidence.see_through(
-        region.rows, look.beams.ends + start, look.beams.is_return, start, fine_m=region.grid.fine_m,
-        rate=options.fade_rate, gap_m=options.free_gap_m, threads=threads,
+        region.rows, look.beams, start, fine_m=region.grid.fine_m, rate=options.fade_rate, gap_m=options.free_gap_m,
+        threads=threads,
     )  # fmt: skip
     return Samples(
         np.concatenate([points, seen.points]),
@@ -382,11 +382,11 @@ def _fit(region: Region, lower: Float64, upper: Float64, effort: FitEffort, thre
     )
     per_step = blocks.n_values * (2 + 2 * effort.gradient_steps)
     cheap = _CHEAP_VALUES // max(per_step, 1)
+    n_newton = int(np.clip(cheap, effort.newton_steps, effort.most_newton_steps))
     fit = warm_fit(
-        blocks, region.rows.occupied[rows], counts[rows], region.kernels.prior_mean[local],
-        region.kernels.prior_var[local], kernels.weight_mean[local], free=free,
-        n_newton=int(np.clip(cheap, effort.newton_steps, effort.most_newton_steps)),
-        n_conjugate_gradient=effort.gradient_steps, longest_step=_LONGEST_STEP, threads=threads,
+        blocks, region.rows.occupied[rows], counts[rows],
+        Prior(region.kernels.prior_mean[local], region.kernels.prior_var[local]), kernels.weight_mean[local],
+        Solver(n_newton, effort.gradient_steps, _LONGEST_STEP), free=free, threads=threads,
     )  # fmt: skip
     if not (np.isfinite(fit.weights).all() and np.isfinite(fit.var).all()):
         raise SolverError(f"the weights of {len(local)} kernels on {len(rows)} rows came out NaN or infinite")

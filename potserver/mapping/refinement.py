@@ -15,7 +15,7 @@ from potserver.numerics import evidence
 from potserver.numerics.beams import LabelledPoints, beam_weights
 from potserver.numerics.feature_blocks import feature_blocks
 from potserver.numerics.geometry import bounds
-from potserver.numerics.warm_fit import warm_fit
+from potserver.numerics.warm_fit import Prior, Solver, warm_fit
 
 FEATURE_CUT = 0.02  # activations below this are left out of solves
 _VOXEL = 2.0  # resolutions: the free points of such a voxel are one datum, the hits of half of it
@@ -110,8 +110,8 @@ def refine(
         threads=threads,
     )  # fmt: skip
     fit = warm_fit(
-        blocks, occupied, counts, prior.weight_mean, prior.weight_var, np.zeros_like(prior.weight_mean),
-        n_newton=effort.newton_steps, n_conjugate_gradient=effort.gradient_steps, threads=threads,
+        blocks, occupied, counts, Prior(prior.weight_mean, prior.weight_var), np.zeros_like(prior.weight_mean),
+        Solver(effort.newton_steps, effort.gradient_steps), threads=threads,
     )  # fmt: skip
     if not (np.isfinite(fit.weights).all() and np.isfinite(fit.var).all()):
         raise SolverError(

@@ -6,10 +6,8 @@ from typing import NamedTuple
 
 import numba as nb
 import numpy as np
-from numpy.typing import NDArray
 
-Float64 = NDArray[np.float64]
-Bool = NDArray[np.bool_]
+from potserver.numerics.arrays import Bool, Float64, Int64
 
 
 class LabelledPoints(NamedTuple):
@@ -17,7 +15,7 @@ class LabelledPoints(NamedTuple):
 
     points: Float64  # (N, 3) m, in the frame of the beams
     occupied: Bool  # (N,) true = hit (y = 1), false = free (y = 0)
-    beam: NDArray[np.int64]  # (N,) number of the beam
+    beam: Int64  # (N,) number of the beam
 
 
 class Beams(NamedTuple):
@@ -81,7 +79,7 @@ def _label(ends, is_return, length, usable, where, free_per_beam):
 def beam_weights(labelled: LabelledPoints) -> Float64:
     """(N,) how much each point counts: a beam's hit 1, and its free points 1 together.
 
-    So hits and free points weigh as beams see them, however many free points are drawn, and a fit needs no bias of its own.
+    A beam's hit and its free space then weigh the same, however many free points are drawn, and a fit needs no bias term.
     """
     free = ~labelled.occupied
     per_beam = np.bincount(labelled.beam[free], minlength=int(labelled.beam.max(initial=-1)) + 1)

@@ -4,12 +4,9 @@ from __future__ import annotations
 
 import numba as nb
 import numpy as np
-from numpy.typing import NDArray
 
+from potserver.numerics.arrays import Float64, Int64
 from potserver.numerics.geometry import bounds
-
-Float64 = NDArray[np.float64]
-Int64 = NDArray[np.int64]
 
 _MAX_CUBES = 2**22  # of the table that is counted into
 _SPLIT = 3  # cubes along an edge of a group

@@ -1,7 +1,7 @@
 """Carry kernels with a coupling: the three out-of-sample maps (paper, section III-B and figure "Parameter optimal transport").
 
-A coupling says where the *source points* go: each to the barycentre of its row. Kernels lie elsewhere, so the map must be
-extended to them. `nearest`: a kernel moves like the source point next to it (what the authors' code does). `linear`: one affine
+A coupling says where the source points go: each to the barycentre of its row. Kernels lie elsewhere, so the map is extended to
+them. `nearest`: a kernel moves like the source point next to it (what the authors' code does). `linear`: one affine
 map fitted to all source points and their images (the paper's words, Perrot et al. 2016). `entropic`: the map that the dual
 potentials define everywhere (Pooladian and Niles-Weed 2021).
 """
@@ -12,12 +12,9 @@ from enum import Enum
 
 import numba as nb
 import numpy as np
-from numpy.typing import NDArray
 
+from potserver.numerics.arrays import Float32, Float64
 from potserver.numerics.coupling import Coupling
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
 
 
 class OutOfSample(str, Enum):

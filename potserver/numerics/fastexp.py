@@ -1,10 +1,10 @@
 """A float32 exponential that the compiler turns into SIMD code.
 
-numba's `np.exp` calls a scalar function for each value (3 to 7 ns); this branch-free one takes about 0.4 ns. Range reduction by
-adding and subtracting 1.5 * 2^23, then a degree-6 polynomial; the largest relative error is 2e-7.
+numba's `np.exp` calls a scalar function for each value (3 to 7 ns); this branch-free one takes about 0.4 ns. It reduces the
+range by adding and subtracting 1.5 * 2^23, then takes a polynomial of degree 6; the largest relative error is 2e-7.
 
-It must stay a function of its own with `contract` as its only fast-math flag: under `reassoc` the compiler cancels the add and
-the subtract, and the result is silently wrong by up to 40 %.
+It must stay a function of its own with `contract` as its only fast-math flag. Under `reassoc` the compiler cancels the addition
+and the subtraction, and results are wrong by up to 40 %, without a warning.
 """
 
 from __future__ import annotations
@@ -17,8 +17,18 @@ from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
 
-# for the loops around exp32; not for exp32 itself
-FAST = {"nnan", "ninf", "nsz", "arcp", "contract", "afn", "reassoc"}
+# For inner loops around exp32, not for exp32 itself. Two rules keep their sums the same to the bit in every run:
+# - They are inlined into the one function that is called from Python. As functions of their own they are compiled in several
+#   copies that add in different orders, and whether the code was compiled or loaded from the cache decides which copy runs.
+# - A loop that sums stores nothing. The compiler guards loops that store by a check of how far apart their arrays lie, and the
+#   guarded and the unguarded loop add in different orders.
+inner_loop = nb.njit(
+    nogil=True,
+    fastmath={"nnan", "ninf", "nsz", "arcp", "contract", "afn", "reassoc"},
+    error_model="numpy",
+    cache=True,
+    forceinline=True,
+)
 
 _f = np.float32
 _LOG2E, _MAGIC = _f(1.44269504088896), _f(12582912.0)

@@ -1,9 +1,9 @@
 """Dense blocks of features: rows are sorted into cubes, and each cube has phi of all its rows and all kernels that reach it.
 
-Against sparse rows a block has one list of kernels for all its rows, so products gather and scatter once a cube and run over
-dense memory; about half of what they touch is smaller than the cut, and still they are several times faster. Blocks are built
-anew for every solve: that costs less than keeping them right while rows move and kernels come. Products are bound by memory:
-blocks of one byte a value, off by at most 1/510, are more than twice as fast as those of four.
+All rows of a block share one list of kernels. So products gather and scatter once a cube and run over dense memory. About half
+of the values are smaller than the cut, and products are still several times faster than with sparse rows. Blocks are built anew
+for every solve, which costs less than updating them when rows move and kernels are added. Products are bound by memory: blocks
+of one byte a value, off by at most 1/510, are more than twice as fast as those of four bytes.
 """
 
 from __future__ import annotations
@@ -12,21 +12,16 @@ from typing import NamedTuple
 
 import numba as nb
 import numpy as np
-from numpy.typing import NDArray
 
+from potserver.numerics.arrays import Float32, Float64, Floats, Int32, Int64, UInt8
 from potserver.numerics.cubes import sort_into_cubes
-from potserver.numerics.fastexp import FAST, exp32
-from potserver.numerics.kernel_index import _box, _gather, build_index
+from potserver.numerics.fastexp import exp32, inner_loop
+from potserver.numerics.gathering import kernels_that_reach
+from potserver.numerics.geometry import bounds
+from potserver.numerics.kernel_index import build_index
 from potserver.numerics.threads import parallel_map, spans
 
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
-Int32 = NDArray[np.int32]
-Int64 = NDArray[np.int64]
-UInt8 = NDArray[np.uint8]
-Floats = NDArray[np.floating]
-
-_SPANS = 8  # of cubes; fixed, because sums over spans must not depend on the number of threads
+_SPANS = 8  # of cubes; fixed, so that sums over spans do not depend on the number of threads
 
 
 class Block(NamedTuple):
@@ -92,9 +87,8 @@ def feature_blocks(
         return Block(
             inside,
             *_build(
-                grouped, inside, groups[span[0] : span[1] + 1] - groups[span[0]], index.hinge, index.columns,
-                index.order, index.level_start, index.level_edge, index.level_cell, index.level_size, index.keys, kind,
-                np.float32(1.0) / unit, np.float32(0.0 if exact else 0.5),
+                grouped, inside, groups[span[0] : span[1] + 1] - groups[span[0]], index, kind, np.float32(1.0) / unit,
+                np.float32(0.0 if exact else 0.5),
             ),
         )  # fmt: skip
 
@@ -105,7 +99,7 @@ def product(blocks: Blocks, weights: Float32, *, threads: int = 1) -> Float32:
     """(N,) Phi w, in the blocks' order."""
     out = np.zeros(len(blocks.order), np.float32)
     parallel_map(
-        lambda b: _product(b.cuts, b.kernels, b.starts, b.numbers, b.phi, blocks.unit, weights, out),
+        lambda b: _product(b, blocks.unit, weights, out),
         blocks.parts,
         threads,
     )
@@ -117,9 +111,7 @@ def gradient_and_diagonal(
 ) -> tuple[Float32, Float32]:
     """(K,) Phi^T r and (K,) diagonal of Phi^T diag(curvature) Phi, in one pass."""
     parts = parallel_map(
-        lambda b: _gradient(
-            b.cuts, b.kernels, b.starts, b.numbers, b.phi, blocks.unit, residual, curvature, blocks.n_kernels
-        ),
+        lambda b: _gradient(b, blocks.unit, residual, curvature, blocks.n_kernels),
         blocks.parts,
         threads,
     )
@@ -132,16 +124,16 @@ def gradient_and_diagonal(
 def normal_product(blocks: Blocks, curvature: Float32, direction: Float32, *, threads: int = 1) -> Float32:
     """(K,) Phi^T diag(curvature) Phi d, in one pass."""
     parts = parallel_map(
-        lambda b: _normal(b.cuts, b.kernels, b.starts, b.numbers, b.phi, blocks.unit, curvature, direction),
+        lambda b: _normal(b, blocks.unit, curvature, direction),
         blocks.parts,
         threads,
     )
     return np.sum(parts, axis=0, dtype=np.float32) if parts else np.zeros(blocks.n_kernels, np.float32)
 
 
-# The inner loops get their row as a slice: with an offset into the whole array the compiler must expect negative indices, and
+# Inner loops get their row as a slice. With an offset into the whole array the compiler has to allow for negative indices, and
 # makes no SIMD code.
-@nb.njit(nogil=True, fastmath=FAST, error_model="numpy", cache=True)
+@inner_loop
 def _phi_row(x, y, z, hx, hy, hz, minus_gamma, out):
     for i in range(len(out)):
         dx = x - hx[i]
@@ -150,44 +142,26 @@ def _phi_row(x, y, z, hx, hy, hz, minus_gamma, out):
         out[i] = exp32(minus_gamma[i] * (dx * dx + dy * dy + dz * dz))
 
 
-@nb.njit(nogil=True, fastmath=FAST, error_model="numpy", cache=True)
+@inner_loop
 def _store(row, scale, offset, out):
     for i in range(len(out)):
         out[i] = row[i] * scale + offset
 
 
 @nb.njit(nogil=True, error_model="numpy", cache=True)
-def _build(
-    points,
-    cuts,
-    groups,
-    hinge,
-    columns,
-    order,
-    level_start,
-    level_edge,
-    level_cell,
-    level_size,
-    keys,
-    kind,
-    scale,
-    offset,
-):
+def _build(points, cuts, groups, index, kind, scale, offset):
+    hinge, columns = index.hinge, index.columns
     n_cubes = len(cuts) - 1
     kernels = np.zeros(n_cubes + 1, np.int64)
     starts = np.zeros(n_cubes + 1, np.int64)
     reached = np.empty(64 * n_cubes + 4096, np.int64)
     found = np.empty(4096, np.int64)
     centre = np.empty((n_cubes, 3))
-    lower = np.empty(3)
-    upper = np.empty(3)
     near = np.empty((4, 4096), np.float32)
-    widest = 0
+    most = 0
     for g in range(len(groups) - 1):
-        _box(points, cuts[groups[g]], cuts[groups[g + 1]], lower, upper)
-        n_near, found = _gather(
-            lower, upper, hinge, columns, level_start, level_edge, level_cell, level_size, keys, found
-        )
+        lower, upper = bounds(points[cuts[groups[g]] : cuts[groups[g + 1]]])
+        n_near, found = kernels_that_reach(index, lower, upper, found)
         if n_near > near.shape[1]:
             near = np.empty((4, 2 * n_near), np.float32)
         gx, gy, gz = lower
@@ -199,7 +173,7 @@ def _build(
             near[3, i] = columns[3, m] * columns[3, m]
         for cube in range(groups[g], groups[g + 1]):
             a, b = cuts[cube], cuts[cube + 1]
-            _box(points, a, b, lower, upper)
+            lower, upper = bounds(points[a:b])
             first = kernels[cube]
             if first + n_near > len(reached):
                 more = np.empty(2 * (first + n_near), np.int64)
@@ -217,12 +191,12 @@ def _build(
                     n += 1
             for c in range(3):
                 centre[cube, c] = 0.5 * (lower[c] + upper[c])
-            widest = max(widest, n)
+            most = max(most, n)
             kernels[cube + 1] = first + n
             starts[cube + 1] = starts[cube] + (b - a) * n
     numbers = np.empty(kernels[-1], np.int32)
     phi = np.empty(starts[-1], kind.dtype)  # of the right size at once: it is large
-    local = np.empty((5, widest), np.float32)
+    local = np.empty((5, most), np.float32)
     for cube in range(n_cubes):
         first, at = kernels[cube], starts[cube]
         n = kernels[cube + 1] - first
@@ -233,7 +207,7 @@ def _build(
             local[1, i] = hinge[m, 1] - cy
             local[2, i] = hinge[m, 2] - cz
             local[3, i] = columns[0, m]
-            numbers[first + i] = order[m]
+            numbers[first + i] = index.order[m]
         for q in range(cuts[cube], cuts[cube + 1]):
             _phi_row(
                 np.float32(points[q, 0] - cx), np.float32(points[q, 1] - cy), np.float32(points[q, 2] - cz),
@@ -244,7 +218,7 @@ def _build(
     return kernels, starts, numbers, phi
 
 
-@nb.njit(nogil=True, fastmath=FAST, error_model="numpy", cache=True)
+@inner_loop
 def _dot(row, w):
     s = np.float32(0)
     for i in range(len(row)):
@@ -252,13 +226,13 @@ def _dot(row, w):
     return s
 
 
-@nb.njit(nogil=True, fastmath=FAST, error_model="numpy", cache=True)
+@inner_loop
 def _axpy(row, a, out):
     for i in range(len(row)):
         out[i] += a * np.float32(row[i])
 
 
-@nb.njit(nogil=True, fastmath=FAST, error_model="numpy", cache=True)
+@inner_loop
 def _axpy_both(row, a, b, out, squares):
     for i in range(len(row)):
         phi = np.float32(row[i])
@@ -267,16 +241,18 @@ def _axpy_both(row, a, b, out, squares):
 
 
 @nb.njit(nogil=True, error_model="numpy", cache=True)
-def _widest(kernels):
-    widest = 0
+def widest(kernels):
+    """The most kernels that reach one cube, from `Block.kernels`."""
+    most = 0
     for c in range(len(kernels) - 1):
-        widest = max(widest, kernels[c + 1] - kernels[c])
-    return widest
+        most = max(most, kernels[c + 1] - kernels[c])
+    return most
 
 
 @nb.njit(nogil=True, error_model="numpy", cache=True)
-def _product(cuts, kernels, starts, numbers, phi, unit, weights, out):
-    w = np.empty(_widest(kernels), np.float32)
+def _product(block, unit, weights, out):
+    cuts, kernels, starts, numbers, phi = block
+    w = np.empty(widest(kernels), np.float32)
     for c in range(len(cuts) - 1):
         first, at = kernels[c], starts[c]
         n = kernels[c + 1] - first
@@ -288,10 +264,10 @@ def _product(cuts, kernels, starts, numbers, phi, unit, weights, out):
 
 
 @nb.njit(nogil=True, error_model="numpy", cache=True)
-def _gradient(cuts, kernels, starts, numbers, phi, unit, residual, curvature, n_kernels):
+def _gradient(block, unit, residual, curvature, n_kernels):
+    cuts, kernels, starts, numbers, phi = block
     out = np.zeros((2, n_kernels), np.float32)
-    widest = _widest(kernels)
-    sums, squares = np.empty(widest, np.float32), np.empty(widest, np.float32)
+    sums, squares = np.empty(widest(kernels), np.float32), np.empty(widest(kernels), np.float32)
     for c in range(len(cuts) - 1):
         first, at = kernels[c], starts[c]
         n = kernels[c + 1] - first
@@ -308,10 +284,10 @@ def _gradient(cuts, kernels, starts, numbers, phi, unit, residual, curvature, n_
 
 
 @nb.njit(nogil=True, error_model="numpy", cache=True)
-def _normal(cuts, kernels, starts, numbers, phi, unit, curvature, direction):
+def _normal(block, unit, curvature, direction):
+    cuts, kernels, starts, numbers, phi = block
     out = np.zeros(len(direction), np.float32)
-    widest = _widest(kernels)
-    d, sums = np.empty(widest, np.float32), np.empty(widest, np.float32)
+    d, sums = np.empty(widest(kernels), np.float32), np.empty(widest(kernels), np.float32)
     for c in range(len(cuts) - 1):
         first, at = kernels[c], starts[c]
         n = kernels[c + 1] - first

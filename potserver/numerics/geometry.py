@@ -8,12 +8,8 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from potserver.numerics.arrays import Bool, Float64, Floats
 from potserver.numerics.voxel_hash import empty_table, enter
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
-Int64 = NDArray[np.int64]
-Bool = NDArray[np.bool_]
 
 _ANGLE_STEPS = 2**32  # of a full turn
 _ANGLE_STEP_RAD = 2.0 * math.pi / _ANGLE_STEPS
@@ -25,7 +21,7 @@ def rotation_z(angle_rad: float) -> Float64:
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
-def rotated_diagonal(variance: NDArray[np.floating], rotation: Float64) -> NDArray[np.floating]:
+def rotated_diagonal(variance: Floats, rotation: Float64) -> Floats:
     """(K, 3) diagonal of R diag(variance) R^T: what is left of a diagonal covariance after a rotation."""
     return variance @ np.square(rotation).T.astype(variance.dtype)
 
@@ -65,9 +61,7 @@ def inside_box(points, lower, upper):
     return out
 
 
-def in_sector(
-    points: NDArray[np.floating], azimuth_min_rad: float, azimuth_max_rad: float, radius_m: float
-) -> Bool:
+def in_sector(points: Floats, azimuth_min_rad: float, azimuth_max_rad: float, radius_m: float) -> Bool:
     """(N,) which points lie in a cylindrical sector (pie slice) about the origin.
 
     Args:
@@ -84,7 +78,7 @@ def in_sector(
     )
 
 
-def voxel_pick(points: NDArray[np.floating], voxel_m: float) -> NDArray[np.intp]:
+def voxel_pick(points: Floats, voxel_m: float) -> NDArray[np.intp]:
     """Numbers of the first point in every occupied voxel, ascending."""
     if len(points) == 0:
         return np.zeros(0, np.intp)
@@ -106,9 +100,7 @@ def _first_of_each(cell, lower, size, table):
     return picked[:n].copy()
 
 
-def thin(
-    points: NDArray[np.floating], n_max: int, voxel_m: float, rng: np.random.Generator
-) -> NDArray[np.intp]:
+def thin(points: Floats, n_max: int, voxel_m: float, rng: np.random.Generator) -> NDArray[np.intp]:
     """Numbers of at most `n_max` points that cover the set: one a voxel, then a random choice among those.
 
     A voxel of 0 leaves the voxels out: a plain random choice.

@@ -6,16 +6,10 @@ import numba as nb
 import numpy as np
 
 from potschemas.answers import LatentGradients
-from potserver.numerics.fastexp import FAST, exp32
-from potserver.numerics.kernel_index import (
-    Float64,
-    KernelIndex,
-    _about_middle,
-    _box,
-    _gather,
-    group_points,
-)
-from potserver.numerics.threads import parallel_map, spans
+from potserver.numerics.arrays import Float64
+from potserver.numerics.fastexp import exp32, inner_loop
+from potserver.numerics.gathering import kernels_around
+from potserver.numerics.kernel_index import KernelIndex, sums_by_cube
 
 
 def latent_gradients(
@@ -29,25 +23,11 @@ def latent_gradients(
     Returns:
         float32.
     """
-    n = len(points)
-    out = np.zeros((9, n), np.float32)
-    if n and len(index.hinge):
-        order, cuts = group_points(points, index.median_reach_m)
-        grouped = points[order]
-        sums = np.zeros((9, n), np.float32)
-
-        def run(span: tuple[int, int]) -> None:
-            _gradient_cubes(
-                grouped, cuts[span[0] : span[1] + 1], index.hinge, index.columns, index.level_start, index.level_edge,
-                index.level_cell, index.level_size, index.keys, sums,
-            )  # fmt: skip
-
-        parallel_map(run, spans(len(cuts) - 1, 16 * threads if threads > 1 else 1), threads, lane)
-        out[:, order] = sums
+    out = sums_by_cube(_gradient_cubes, 9, index, points, threads, lane)
     return LatentGradients(*(np.ascontiguousarray(out[i : i + 3].T) for i in (0, 3, 6)))
 
 
-@nb.njit(nogil=True, fastmath=FAST, error_model="numpy", cache=True)
+@inner_loop
 def _gradient_point(x, y, z, hx, hy, hz, minus_gamma, w, v, n):
     mx = my = mz = np.float32(0)
     vx = vy = vz = np.float32(0)
@@ -74,20 +54,12 @@ def _gradient_point(x, y, z, hx, hy, hz, minus_gamma, w, v, n):
 
 
 @nb.njit(nogil=True, error_model="numpy", cache=True)
-def _gradient_cubes(
-    points, cuts, hinge, columns, level_start, level_edge, level_cell, level_size, keys, sums
-):
+def _gradient_cubes(points, cuts, index, sums):
     found = np.empty(4096, np.int64)
     local = np.empty((6, 4096), np.float32)
-    lower = np.empty(3)
-    upper = np.empty(3)
     for cube in range(len(cuts) - 1):
         a, b = cuts[cube], cuts[cube + 1]
-        _box(points, a, b, lower, upper)
-        n, found = _gather(
-            lower, upper, hinge, columns, level_start, level_edge, level_cell, level_size, keys, found
-        )
-        local, cx, cy, cz = _about_middle(lower, upper, hinge, columns, found, n, local)
+        n, found, local, cx, cy, cz = kernels_around(index, points[a:b], found, local)
         for q in range(a, b):
             sums[0, q], sums[1, q], sums[2, q], sums[3, q], sums[4, q], sums[5, q], sums[6, q], sums[7, q], sums[
                 8, q

@@ -3,42 +3,39 @@
     latent mean  sum_m w_m phi_m(x),   latent variance  sum_m v_m phi_m(x)^2,   activation  sum_m phi_m(x)
     phi_m(x) = exp(-gamma_m |x - h_m|^2)                                                        (paper eq. 1)
 
-A kernel's reach is where what it adds falls below a cut tau, which depends on its gamma, weight *and* variance. tau is
-chosen by measuring: at sample points, the absolute sum of everything cut must change the probability by less than a budget.
-Kernels are sorted into levels by reach (a factor of two each), every level into its own grid of cells, so wide and narrow
-ones cost alike. Queries are sorted into cubes; the kernels that reach a cube are gathered once, relative to its centre (so
-large coordinates lose nothing in float32), and a dense SIMD loop runs over queries times gathered kernels.
+A kernel reaches as far as what it adds is above a cut tau; that depends on its gamma, weight and variance. tau is found by
+measuring: at sample points, all that is cut together may change the probability by less than a budget. Kernels are sorted into
+levels by reach, a factor of two each, and every level into its own grid of cells, so that wide and narrow ones cost the same.
+Points are sorted into cubes. The kernels that reach a cube are gathered once (`gathering`), and a dense SIMD loop runs over
+points times kernels.
 """
 
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numba as nb
 import numpy as np
-from numpy.typing import NDArray
 
 from potschemas.answers import LatentSums
+from potserver.numerics.arrays import Float32, Float64, Floats, Int64
 from potserver.numerics.cubes import sort_into_cubes
-from potserver.numerics.fastexp import FAST, exp32
+from potserver.numerics.fastexp import exp32, inner_loop
+from potserver.numerics.gathering import kernels_around
 from potserver.numerics.geometry import bounds, inside_box
 from potserver.numerics.threads import parallel_map, spans
 from potserver.numerics.voxel_hash import empty_table, enter
 
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
-Int64 = NDArray[np.int64]
-Floats = NDArray[np.floating]
-
-_PROBABILITY_BUDGET = 4e-5  # of a probability, for all cut kernels together
-_TAUS = np.logspace(-3, -12, 10)
-_SAMPLES = 96
-_FRINGE = 25.0  # gamma d^2 out to which samples lie
-_STACK = 4.0  # kernels within a width of each other that are nothing special
-_TARGET_QUERIES_PER_CUBE = 24
-_PART_CUBE_M = 10.0  # a third of the edge within which points ask together
-_WORTH_THREADS = 4096  # points below which one thread is as fast as several
+_PROBABILITY_BUDGET = 4e-5  # by which all cut kernels together may change a probability
+_TAUS = np.logspace(-3, -12, 10)  # the cuts to choose from
+_SAMPLES = 96  # points at which cuts are measured
+_FRINGE = 25.0  # the largest gamma d^2 of a sample
+_STACK = 4.0  # kernels within a width of each other, from which on their reach grows
+_TARGET_QUERIES_PER_CUBE = 24  # points a cube, on average, at least
+_PART_CUBE_M = 10.0  # a third of the edge of the cubes whose points ask the parts of a map together
+_WORTH_THREADS = 4096  # points; with fewer one thread is as fast as several
 
 
 class KernelIndex(NamedTuple):
@@ -92,12 +89,12 @@ def choose_tau(hinge: Float64, gamma: Float64, weight: Float64, variance: Float6
 def stack_sizes(hinge: Float64, gamma: Float64) -> Float64:
     """(K,) about how many kernels of a kernel's own width lie within that width of it, itself included.
 
-    Many kernels on one spot (a robot that stands still, and maps that are concatenated) each fall below a cut that their sum
-    does not; a sample of the kernels need not meet such a stack.
+    Where many kernels lie on one spot (a robot that stands still, maps that are concatenated), each may fall below a cut while
+    their sum does not. The samples of `choose_tau` may miss such a stack.
     """
     level = np.rint(0.5 * np.log2(gamma))
     cell = np.floor(hinge * np.exp2(level)[:, None])
-    # cells are told apart by a mixed number, not by sorting rows: a rare collision only widens a reach
+    # one number a cell is faster than three; a rare collision widens a reach
     key = (cell @ np.array([1.0, 7919.0, 104729.0]) + 15485863.0 * level).astype(np.int64)
     return np.asarray(_times_there(key, empty_table(len(key))), np.float64)
 
@@ -134,7 +131,7 @@ def build_index(
         variance: (K,) log-odds^2, >= 0.
         activation_cut: phi below this is left out of the activation sum too.
         tau: The cut, if it is known already; measured otherwise.
-        guard_stacks: Let kernels that lie on one spot reach farther, because their sum falls below a cut later than each does.
+        guard_stacks: Let kernels reach farther where many lie on one spot, see `stack_sizes`.
     """
     hinge = np.ascontiguousarray(hinge, np.float64)
     gamma, weight, variance = (np.asarray(a, np.float64) for a in (gamma, weight, variance))
@@ -144,7 +141,7 @@ def build_index(
     if guard_stacks:
         exponent += np.log(np.maximum(stack_sizes(hinge, gamma) / _STACK, 1.0))
     r = np.sqrt(exponent / gamma)
-    # levels halve the reach; a floor keeps one tiny kernel from making a level of its own
+    # each level has half the reach of the one above; all kernels of tiny reach share the last one
     top = float(r.max(initial=1e-3))
     level = np.clip(np.ceil(np.log2(np.maximum(r, 1e-6) / top)).astype(np.int64), -12, 0)
     used = np.unique(level)[::-1]
@@ -194,24 +191,39 @@ def latent_sums(index: KernelIndex, points: Float64, *, threads: int = 1, lane: 
         float32.
     Source: paper eq. 1; variance of a factorised posterior.
     """
+    return LatentSums(*sums_by_cube(_sum_cubes, 3, index, points, threads, lane))
+
+
+def sums_by_cube(
+    sum_cubes: Callable[[Float64, Int64, KernelIndex, Float32], None],
+    n_sums: int,
+    index: KernelIndex,
+    points: Float64,
+    threads: int,
+    lane: str,
+) -> Float32:
+    """(S, N) sums at N points, by a compiled loop over cubes of points.
+
+    Args:
+        sum_cubes: `f(points, cuts, index, out)` writes columns cuts[0] to cuts[-1] of `out`, (S, N); cube c is
+            points[cuts[c]:cuts[c + 1]].
+        n_sums: S.
+        index, points, threads, lane: See `latent_sums`.
+    """
     n = len(points)
-    out = np.zeros((3, n), np.float32)
+    out = np.zeros((n_sums, n), np.float32)
     if n == 0 or len(index.hinge) == 0:
-        return LatentSums(*out)
+        return out
     order, cuts = group_points(points, index.median_reach_m)
     grouped = points[order]
-    sums = np.zeros((3, n), np.float32)
-
-    def run(span: tuple[int, int]) -> None:
-        _sum_cubes(
-            grouped, cuts[span[0] : span[1] + 1], index.hinge, index.columns, index.level_start, index.level_edge,
-            index.level_cell, index.level_size, index.keys, sums,
-        )  # fmt: skip
-
+    sums = np.zeros((n_sums, n), np.float32)
     threads = threads if n >= _WORTH_THREADS else 1
-    parallel_map(run, spans(len(cuts) - 1, 4 * threads if threads > 1 else 1), threads, lane)
+    parallel_map(
+        lambda span: sum_cubes(grouped, cuts[span[0] : span[1] + 1], index, sums),
+        spans(len(cuts) - 1, 4 * threads if threads > 1 else 1), threads, lane,
+    )  # fmt: skip
     out[:, order] = sums
-    return LatentSums(*out)
+    return out
 
 
 class IndexParts(NamedTuple):
@@ -232,7 +244,7 @@ class IndexParts(NamedTuple):
 def latent_sums_of_parts(
     parts: IndexParts, points: Float64, *, threads: int = 1, lane: str = "map"
 ) -> LatentSums:
-    """`latent_sums` over all parts of a map. Points near each other ask together, and only the parts that reach them."""
+    """`latent_sums` over all parts of a map. Points near each other ask together, and they ask only parts that reach them."""
     if len(parts.indices) == 1:
         return latent_sums(parts.indices[0], points, threads=threads, lane=lane)
     total = LatentSums(*np.zeros((3, len(points)), np.float32))
@@ -309,60 +321,7 @@ def _cut_sums(points, hinge, gamma, weight, variance, taus):
     return cut_mean, cut_var, total
 
 
-@nb.njit(nogil=True, error_model="numpy", cache=True)
-def _lower_bound(keys, low, high, key):
-    while low < high:
-        middle = (low + high) >> 1
-        if keys[middle] < key:
-            low = middle + 1
-        else:
-            high = middle
-    return low
-
-
-@nb.njit(nogil=True, error_model="numpy", cache=True)
-def _gather(
-    box_lower, box_upper, hinge, columns, level_start, level_edge, level_cell, level_size, keys, found
-):
-    """Numbers (in index order) of the kernels that reach the box; returns how many, and the buffer, grown if need be."""
-    n = 0
-    for level in range(len(level_edge)):
-        edge = level_edge[level]
-        first, last = level_start[level], level_start[level + 1]
-        nx, ny, nz = level_size[level]
-        x0 = max(int(np.floor(box_lower[0] / edge)) - 1 - level_cell[level, 0], 0)
-        y0 = max(int(np.floor(box_lower[1] / edge)) - 1 - level_cell[level, 1], 0)
-        z0 = max(int(np.floor(box_lower[2] / edge)) - 1 - level_cell[level, 2], 0)
-        x1 = min(int(np.floor(box_upper[0] / edge)) + 1 - level_cell[level, 0], nx - 1)
-        y1 = min(int(np.floor(box_upper[1] / edge)) + 1 - level_cell[level, 1], ny - 1)
-        z1 = min(int(np.floor(box_upper[2] / edge)) + 1 - level_cell[level, 2], nz - 1)
-        if x1 < x0 or y1 < y0 or z1 < z0:
-            continue
-        # a box over more rows of small cells than the level has kernels: one row that holds them all
-        whole = (y1 - y0 + 1) * (z1 - z0 + 1) > last - first
-        rows_z, rows_y = (1, 1) if whole else (z1 - z0 + 1, y1 - y0 + 1)
-        for z in range(z0, z0 + rows_z):
-            for y in range(y0, y0 + rows_y):
-                row = (z * ny + y) * nx
-                low = first if whole else _lower_bound(keys, first, last, row + x0)
-                for m in range(low, last):
-                    if not whole and keys[m] > row + x1:
-                        break
-                    d2 = 0.0
-                    for c in range(3):
-                        d = max(max(box_lower[c] - hinge[m, c], hinge[m, c] - box_upper[c]), 0.0)
-                        d2 += d * d
-                    if d2 <= columns[3, m] * columns[3, m]:
-                        if n == len(found):
-                            larger = np.empty(2 * n, np.int64)
-                            larger[:n] = found
-                            found = larger
-                        found[n] = m
-                        n += 1
-    return n, found
-
-
-@nb.njit(nogil=True, fastmath=FAST, error_model="numpy", cache=True)
+@inner_loop
 def _sum_point(x, y, z, hx, hy, hz, minus_gamma, w, v, n):
     mean = np.float32(0)
     var = np.float32(0)
@@ -379,47 +338,12 @@ def _sum_point(x, y, z, hx, hy, hz, minus_gamma, w, v, n):
 
 
 @nb.njit(nogil=True, error_model="numpy", cache=True)
-def _box(points, a, b, lower, upper):
-    for c in range(3):
-        lower[c] = points[a, c]
-        upper[c] = points[a, c]
-        for q in range(a + 1, b):
-            lower[c] = min(lower[c], points[q, c])
-            upper[c] = max(upper[c], points[q, c])
-
-
-@nb.njit(nogil=True, error_model="numpy", cache=True)
-def _about_middle(lower, upper, hinge, columns, found, n, local):
-    """The n found kernels in `local`, made longer if need be, with hinges relative to the middle of a box; and that middle."""
-    if n > local.shape[1]:
-        local = np.empty((6, 2 * n), np.float32)
-    cx = 0.5 * (lower[0] + upper[0])
-    cy = 0.5 * (lower[1] + upper[1])
-    cz = 0.5 * (lower[2] + upper[2])
-    for i in range(n):
-        m = found[i]
-        local[0, i] = hinge[m, 0] - cx
-        local[1, i] = hinge[m, 1] - cy
-        local[2, i] = hinge[m, 2] - cz
-        local[3, i] = columns[0, m]
-        local[4, i] = columns[1, m]
-        local[5, i] = columns[2, m]
-    return local, cx, cy, cz
-
-
-@nb.njit(nogil=True, error_model="numpy", cache=True)
-def _sum_cubes(points, cuts, hinge, columns, level_start, level_edge, level_cell, level_size, keys, sums):
+def _sum_cubes(points, cuts, index, sums):
     found = np.empty(4096, np.int64)
     local = np.empty((6, 4096), np.float32)
-    lower = np.empty(3)
-    upper = np.empty(3)
     for cube in range(len(cuts) - 1):
         a, b = cuts[cube], cuts[cube + 1]
-        _box(points, a, b, lower, upper)
-        n, found = _gather(
-            lower, upper, hinge, columns, level_start, level_edge, level_cell, level_size, keys, found
-        )
-        local, cx, cy, cz = _about_middle(lower, upper, hinge, columns, found, n, local)
+        n, found, local, cx, cy, cz = kernels_around(index, points[a:b], found, local)
         for q in range(a, b):
             sums[0, q], sums[1, q], sums[2, q] = _sum_point(
                 np.float32(points[q, 0] - cx), np.float32(points[q, 1] - cy), np.float32(points[q, 2] - cz),

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numba as nb
 import numpy as np
 
-from potserver.numerics.kernel_index import Float64, Int64
+from potserver.numerics.arrays import Float64, Int64
 
 
 def most_cells(radii_m: Float64, edge_m: float, dims: int) -> float:
-    """No more cells than this are covered by one ball of each radius: their cubes lie inside a ball half a diagonal larger."""
+    """An upper bound on the cells that one ball of each radius covers: their cubes lie in a ball larger by half a diagonal."""
     reach = np.asarray(radii_m, np.float64) / edge_m + 0.5 * np.sqrt(dims)
     volume = 4.0 / 3.0 * np.pi * reach**3 if dims == 3 else np.pi * reach**2
     return float(np.sum(np.floor(volume) + 1.0))

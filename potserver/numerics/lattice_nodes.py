@@ -1,14 +1,12 @@
-"""Nodes of a kernel lattice: where a map that is told nothing else puts its kernels."""
+"""Nodes of a kernel lattice: cells that get a kernel because points lie in or near them."""
 
 from __future__ import annotations
 
 import numba as nb
 import numpy as np
-from numpy.typing import NDArray
 
+from potserver.numerics.arrays import Float64
 from potserver.numerics.voxel_hash import empty_table, find, pack
-
-Float64 = NDArray[np.float64]
 
 
 def new_nodes(
@@ -21,8 +19,8 @@ def new_nodes(
 ) -> Float64:
     """Centres of the lattice cells that points ask for and that have no kernel yet.
 
-    A point asks for the cell that it lies in, and for those of the 26 around whose centres are nearer than `within` spacings.
-    With its own cell alone, how much a point is told would depend on where in the lattice it happens to lie.
+    A point asks for the cell that it lies in, and for those of the 26 around it with centres nearer than `within` spacings.
+    Without these, the activation at a point would depend on where in its cell it lies.
 
     Args:
         points: (N, 3) m.
@@ -34,7 +32,7 @@ def new_nodes(
         (M, 3) m, in the order in which the points ask for them.
     """
     capacity = len(present) + len(points) * (1 if within <= 0 else 9 if planar else 27)
-    # few are new, as a rule: the table grows only when it must
+    # most points ask for cells that are there: start small and grow
     size = min(capacity, len(present) + 4 * len(points) + 64)
     while True:
         table = empty_table(size)

@@ -2,13 +2,15 @@
 
     hazard(r) = -ln(1 - p(r)) / width(r)      P(nothing met before r) = exp(-integral of the hazard from 0 to r)
 
-p is the predictive mean of the occupancy at the ray's point r, and the width, in metres, is the length over which p counts as
-one trial: a stretch of that length with constant p stops the ray with probability p, in however many steps it is summed. So the
-answer has a limit as the step goes to zero, where independent trials a step would stop every ray at once. Unless a width is
-given, a point takes that of the kernels there: the mean of sqrt(pi / (2 gamma)), the integral of a squared kernel along a line
-through its hinge, weighted by activation. Values of the latent that the same kernel made are then one trial and not many; among
-multiples of 1 / sqrt(gamma) this one gave the least biased median ranges in made-up towns. With p = sigmoid(z), -ln(1 - p) is
-softplus(z), which loses nothing near 0 and 1.
+p(r) is the predictive mean of the occupancy at range r. The width, in metres, is the length over which p counts as one trial: a
+stretch of that length with constant p stops the ray with probability p. The answer therefore has a limit as the step goes to
+zero; one independent trial a step would stop every ray at once.
+
+Unless a width is given, a point takes the width of the kernels there: the mean over the kernels, weighted by their activation,
+of sqrt(pi / (2 gamma)), the integral of a squared kernel along a line through its hinge. Points that share a kernel then count
+as one trial together. Among multiples of 1 / sqrt(gamma) this one gave the least biased median ranges in made-up towns.
+
+With p = sigmoid(z), -ln(1 - p) is softplus(z), which is exact near 0 and 1 too.
 """
 
 from __future__ import annotations
@@ -20,18 +22,34 @@ import numba as nb
 import numpy as np
 
 from potschemas.answers import AnswerRule
-from potserver.numerics.fastexp import FAST, exp32
-from potserver.numerics.kernel_index import Float64, Int64, KernelIndex, _gather
+from potserver.numerics.arrays import Float64, Int64
+from potserver.numerics.fastexp import exp32, inner_loop
+from potserver.numerics.gathering import kernels_that_reach
+from potserver.numerics.kernel_index import KernelIndex
 from potserver.numerics.threads import parallel_map, spans
 
-_END_OF_RAY = (
-    1e-7  # survival below which a ray has ended: no moment or probability changes by more than this share
-)
-_BLOCK_REACHES = (
-    3.0  # so many reaches of a kernel make the stretch for which kernels are gathered together: measured
-)
-_BLOCK_STEPS = (4, 128)  # the same in steps, least and most
-_WIDTH_OF_NOTHING_M = 1.0  # of unobserved space, in a map without kernels
+_END_OF_RAY = 1e-7  # survival below which a ray ends: the share by which a moment or a probability may be off
+# Length of the stretch of a ray that shares a list of kernels, in reaches of a kernel; measured.
+_BLOCK_REACHES = 3.0
+_BLOCK_STEPS = (4, 128)  # the least and the most steps of such a stretch
+_WIDTH_OF_NOTHING_M = 1.0  # width in a map without kernels
+
+
+class Rays(NamedTuple):
+    """N rays in the frame of the hinges."""
+
+    origins: Float64  # (N, 3) m
+    directions: Float64  # (N, 3) of unit length
+    max_range_m: Float64  # (N,) m, > 0
+
+
+class RayOptions(NamedTuple):
+    """How rays are marched, and what they say."""
+
+    step_m: float  # longest step
+    quantiles: Float64  # (Q,) ascending, in (0, 1), of the range
+    unknown_rate: float  # hazard of unobserved space, 1/m; infinite: it stops a ray at once
+    width_m: float | None  # what counts as one trial, m; None: the kernels' own
 
 
 class FirstReturns(NamedTuple):
@@ -66,55 +84,52 @@ def count_steps(max_range_m: Float64, step_m: float) -> Int64:
 
 
 def first_returns(
-    index: KernelIndex,
-    origins: Float64,
-    directions: Float64,
-    max_range_m: Float64,
-    *,
-    step_m: float,
-    quantiles: Float64,
-    unknown_rate: float,
-    width_m: float | None,
-    rule: AnswerRule,
-    threads: int = 1,
+    index: KernelIndex, rays: Rays, options: RayOptions, rule: AnswerRule, *, threads: int = 1
 ) -> FirstReturns:
     """March rays by the midpoint rule, whose error falls with the square of the step.
 
-    Only kernels whose reach (see `kernel_index`) meets a stretch of the ray are summed there; often that is none.
+    Only the kernels that reach a stretch of a ray (see `kernel_index.reach`) are summed there.
 
     Args:
-        origins: (N, 3) m, same frame as the hinges.
-        directions: (N, 3) of unit length.
-        max_range_m: (N,) m, > 0.
-        step_m: Longest step.
-        quantiles: (Q,) ascending, in (0, 1).
-        unknown_rate: Hazard of unobserved space, 1/m; infinite = it stops a ray at once.
-        width_m: What counts as one trial, m; None = the kernels' own.
-        rule: What the kernels' sums say.
+        index: The kernels.
+        rays: Where to look.
+        options: How.
+        rule: How sums over kernels become an occupancy.
         threads: Threads to spread the rays over.
     """
-    # copies: the compiled march is one for plain writable arrays, and received ones are read-only
-    origins, directions, max_range_m = (
-        np.array(a, np.float64, order="C") for a in (origins, directions, max_range_m)
-    )
-    n = len(origins)
+    # copies: the march is compiled for writable arrays, and arrays that were received are read-only
+    rays = Rays(*(np.array(a, np.float64, order="C") for a in rays))
+    n = len(rays.origins)
     out = np.zeros((5, n))
-    quantile_m = np.zeros((n, len(quantiles)))
-    n_steps = count_steps(max_range_m, step_m)
+    quantile_m = np.zeros((n, len(options.quantiles)))
+    n_steps = count_steps(rays.max_range_m, options.step_m)
     widths = kernel_widths(index).astype(np.float32)
-    block = int(np.clip(_BLOCK_REACHES * index.median_reach_m / step_m, *_BLOCK_STEPS))
-    thresholds = -np.log1p(-np.asarray(quantiles, np.float64))
+    block = int(np.clip(_BLOCK_REACHES * index.median_reach_m / options.step_m, *_BLOCK_STEPS))
+    march = _March(
+        thresholds=-np.log1p(-np.asarray(options.quantiles, np.float64)),
+        unknown_rate=float(options.unknown_rate),
+        fixed_width_m=-1.0 if options.width_m is None else float(options.width_m),
+        observed_activation=float(rule.observed_activation),
+        residual_var=float(rule.residual_var),
+        mean_moderation=float(rule.mean_moderation),
+    )
 
     def run(span: tuple[int, int]) -> None:
-        _march(
-            span[0], span[1], origins, directions, max_range_m, n_steps, block, thresholds, float(unknown_rate),
-            -1.0 if width_m is None else float(width_m), rule.observed_activation, rule.residual_var,
-            rule.mean_moderation, index.hinge, index.columns, widths, index.level_start, index.level_edge, index.level_cell,
-            index.level_size, index.keys, out, quantile_m,
-        )  # fmt: skip
+        _march(*span, rays, n_steps, block, march, index, widths, out, quantile_m)
 
     parallel_map(run, spans(n, 8 * threads if threads > 1 else 1), threads, "query")
     return FirstReturns(out[0], out[1], out[2], quantile_m, out[3], out[4])
+
+
+class _March(NamedTuple):
+    """What the compiled march needs to turn sums into ranges."""
+
+    thresholds: Float64  # (Q,) hazard integrals at which the quantiles lie
+    unknown_rate: float  # 1/m
+    fixed_width_m: float  # negative: the kernels' own
+    observed_activation: float
+    residual_var: float  # log-odds^2
+    mean_moderation: float
 
 
 @nb.njit(error_model="numpy", cache=True)
@@ -131,7 +146,7 @@ def _softplus(z: float) -> float:
     return max(z, 0.0) + math.log1p(math.exp(-abs(z)))
 
 
-@nb.njit(nogil=True, fastmath=FAST, error_model="numpy", cache=True)
+@inner_loop
 def _sum_at(t, along, across2, minus_gamma, w, v, width, n):
     mean = np.float32(0)
     var = np.float32(0)
@@ -148,16 +163,12 @@ def _sum_at(t, along, across2, minus_gamma, w, v, width, n):
 
 
 @nb.njit(nogil=True, error_model="numpy", cache=True)
-def _march(
-    first, last, origins, directions, max_range_m, n_steps, block, thresholds, unknown_rate, fixed_width_m,
-    observed_activation, residual_var, mean_moderation, hinge, columns, widths, level_start, level_edge, level_cell,
-    level_size, keys, out, quantile_m,
-):  # fmt: skip
+def _march(first, last, rays, n_steps, block, march, index, widths, out, quantile_m):
+    origins, directions, max_range_m = rays
+    hinge, columns, thresholds = index.hinge, index.columns, march.thresholds
     found = np.empty(4096, np.int64)
     local = np.empty((6, 4096), np.float32)
-    lower = np.empty(3)
-    upper = np.empty(3)
-    middle = np.empty(3)
+    lower, upper, middle = np.empty(3), np.empty(3), np.empty(3)
     for i in range(first, last):
         h = max_range_m[i] / n_steps[i]
         hazard = 0.0  # its integral so far
@@ -177,9 +188,7 @@ def _march(
                     middle[c] = origins[i, c] + centre * directions[i, c]
                     lower[c] = middle[c] - half * abs(directions[i, c])
                     upper[c] = middle[c] + half * abs(directions[i, c])
-                n_found, found = _gather(
-                    lower, upper, hinge, columns, level_start, level_edge, level_cell, level_size, keys, found
-                )
+                n_found, found = kernels_that_reach(index, lower, upper, found)
                 if n_found > local.shape[1]:
                     local = np.empty((6, 2 * n_found), np.float32)
                 n = 0
@@ -204,22 +213,16 @@ def _march(
             r = step * h
             step += 1
             mean, var, activation, weighted = _sum_at(
-                np.float32(r + 0.5 * h - centre),
-                local[0],
-                local[1],
-                local[2],
-                local[3],
-                local[4],
-                local[5],
-                n,
-            )
-            if n > 0 and activation >= observed_activation:
+                np.float32(r + 0.5 * h - centre), local[0], local[1], local[2], local[3], local[4], local[5], n
+            )  # fmt: skip
+            if n > 0 and activation >= march.observed_activation:
                 is_known = True
-                width = fixed_width_m if fixed_width_m > 0 else weighted / activation
-                rate = _softplus(moderated(mean, var, activation, residual_var, mean_moderation)) / width
+                width = march.fixed_width_m if march.fixed_width_m > 0 else weighted / activation
+                z = moderated(mean, var, activation, march.residual_var, march.mean_moderation)
+                rate = _softplus(z) / width
             else:
                 is_known = False
-                rate = unknown_rate
+                rate = march.unknown_rate
                 if math.isnan(unknown_range):
                     unknown_range = r
             if rate == np.inf:

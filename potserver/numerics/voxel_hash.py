@@ -8,10 +8,8 @@ from __future__ import annotations
 
 import numba as nb
 import numpy as np
-from numpy.typing import NDArray
 
-Int64 = NDArray[np.int64]
-Int32 = NDArray[np.int32]
+from potserver.numerics.arrays import Int32
 
 CELL_LIMIT = 2**19
 
@@ -56,3 +54,15 @@ def enter(table, keys, n, key):
         table[place] = n
         keys[n] = key
     return np.int64(table[place])
+
+
+@nb.njit(nogil=True, error_model="numpy", cache=True)
+def any_around(table, keys, kind, voxel, reach):
+    """Whether a voxel of a kind, (3,) numbers, or one at most `reach` voxels from it along each axis, has an entry."""
+    for dx in range(-reach, reach + 1):
+        for dy in range(-reach, reach + 1):
+            for dz in range(-reach, reach + 1):
+                key = pack(kind, voxel[0] + dx, voxel[1] + dy, voxel[2] + dz)
+                if table[find(table, keys, key)] >= 0:
+                    return True
+    return False

@@ -2,55 +2,71 @@
 
     minimise  sum_n c_n (log(1 + exp(f_n)) - y_n f_n) + 1/2 sum_m (w_m - prior_mean_m)^2 / prior_var_m,    f = Phi w
 
-It does a bounded amount of work and is never far from the last optimum, but for where the world has changed. There plain Newton
-gets stuck: a row that is surely wrong has no curvature left, steps overshoot and every line search fails. Rows on the wrong
-side take the curvature of the quadratic bound of Jaakkola and Jordan (1997), with which no step overshoots, and every row has a
-least curvature: the higher, the more cautious the steps, and the farther from the optimum they end. Without a floor to speak
-of and with more steps this is a solver like any other.
+The work is bounded, and the last weights are near the optimum but for where the world has changed. Plain Newton gets stuck
+there: a row that is surely wrong has no curvature left, steps overshoot and every line search fails. Two things help. Rows on
+the wrong side take the curvature of the quadratic bound of Jaakkola and Jordan (1997), with which no step overshoots. Every row
+has a least curvature: a higher one makes shorter steps, and ends farther from the optimum. With a tiny least curvature and many
+steps this is an ordinary Newton solver.
 """
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numba as nb
 import numpy as np
-from numpy.typing import NDArray
 
+from potserver.numerics.arrays import Bool, Float32
 from potserver.numerics.feature_blocks import Blocks, gradient_and_diagonal, normal_product, product
 
-Float32 = NDArray[np.float32]
-Bool = NDArray[np.bool_]
+_SHRINK = 0.25  # by which the line search shortens a step that is too long
+_TRIALS = 12  # of the line search, at most
+_ENOUGH = 1e-5  # relative gain of the objective below which steps end
 
-_SHRINK, _TRIALS = 0.25, 12  # of the line search
-_ENOUGH = 1e-5  # relative gain of the objective below which more steps are not worth it
+
+class Prior(NamedTuple):
+    """Independent normal distributions of K weights."""
+
+    mean: Float32  # (K,) log-odds
+    var: Float32  # (K,) log-odds^2, > 0
+
+
+class Solver(NamedTuple):
+    """How far and how cautiously to go."""
+
+    n_newton: int = 2  # Newton steps at most
+    n_conjugate_gradient: int = 4  # conjugate-gradient steps for each of them
+    # A Newton step that lowers the objective is doubled up to this length, in Newton steps, while that lowers it further. Where
+    # labels part cleanly the weights have far to go and Newton's steps are short; a trial costs no product with Phi.
+    longest_step: float = 1.0
+    least_curvature: float = 0.01  # of a row that counts once, > 0
 
 
 class WarmFit(NamedTuple):
     """Weights after some Newton steps, and how they ended."""
 
     weights: Float32  # (K,) log-odds
-    var: Float32  # (K,) log-odds^2: 1 / diagonal of the Hessian at the last step, variance of each weight given the others
+    var: Float32  # (K,) log-odds^2: 1 / diagonal of the Hessian at the last step, the variance given the other weights
     support: Float32  # (K,) what the data add to that diagonal
     objective: float
     objective_at_start: float
     n_newton: int
-    converged: bool  # false: a step found nothing better although the gradient says so; the weights are the best found
+    converged: (
+        bool  # false: the gradient promises a gain that no trial step found; the weights are the best found
+    )
 
 
 def warm_fit(
     blocks: Blocks,
     labels: Bool,
     counts: Float32,
-    prior_mean: Float32,
-    prior_var: Float32,
+    prior: Prior,
     start: Float32,
+    solver: Solver | None = None,
     *,
     free: Bool | None = None,
-    n_newton: int = 2,
-    n_conjugate_gradient: int = 4,
-    least_curvature: float = 0.01,
-    longest_step: float = 1.0,
     threads: int = 1,
 ) -> WarmFit:
     """Improve the weights of K kernels on N labelled rows.
@@ -59,25 +75,21 @@ def warm_fit(
         blocks: Phi.
         labels: (N,) true = occupied, in the order of the points that the blocks were built from.
         counts: (N,) how much each row counts, >= 0, same order.
-        prior_mean: (K,) log-odds.
-        prior_var: (K,) log-odds^2, > 0.
+        prior: Of the weights.
         start: (K,) log-odds: the weights as they are.
-        free: (K,) which weights may change; all by default. The others still count in f.
-        n_newton: Newton steps at most.
-        n_conjugate_gradient: Conjugate-gradient steps for each.
-        least_curvature: Of a row that counts once, > 0.
-        longest_step: In Newton steps: a step that does is doubled up to this, as long as twice as far is better still. Where
-            labels part cleanly the weights have far to go, and Newton's steps are cautious; to try costs no product with Phi.
+        solver: How; two cautious steps by default.
+        free: (K,) which weights may change; all by default. The others are held, and count in f.
         threads: Threads for the products with the features.
     """
+    solver = solver or Solver()
     y, c = labels[blocks.order], np.ascontiguousarray(counts[blocks.order], np.float32)
-    precision = (1.0 / prior_var).astype(np.float32)
+    precision = (1.0 / prior.var).astype(np.float32)
     mask = np.ones(len(start), np.float32) if free is None else free.astype(np.float32)
     w = start.astype(np.float32)
     f = product(blocks, w, threads=threads)
 
     def objective(change: Float32, step: Float32, size: float) -> float:
-        off = (w + np.float32(size) * step - prior_mean).astype(np.float64)
+        off = (w + np.float32(size) * step - prior.mean).astype(np.float64)
         return float(
             _loss(f, change, np.float32(size), y, c) + 0.5 * (precision * mask * np.square(off)).sum()
         )
@@ -85,42 +97,60 @@ def warm_fit(
     diagonal = precision
     value = at_start = objective(f, np.zeros_like(w), 0.0)
     steps, converged = 0, True
-    while steps < n_newton:
-        residual, curvature = _terms(f, y, c, np.float32(least_curvature))
+    while steps < solver.n_newton:
+        residual, curvature = _terms(f, y, c, np.float32(solver.least_curvature))
         gradient, diagonal = gradient_and_diagonal(blocks, residual, curvature, threads=threads)
         diagonal = diagonal + precision
-        gradient = (gradient + precision * (w - prior_mean)) * mask
+        gradient = (gradient + precision * (w - prior.mean)) * mask
         step = _conjugate_gradient(
             lambda d, curvature=curvature: (
                 (normal_product(blocks, curvature, d, threads=threads) + precision * d) * mask
             ),
-            -gradient, diagonal, n_conjugate_gradient,
+            -gradient, diagonal, solver.n_conjugate_gradient,
         )  # fmt: skip
         slope = float(gradient @ step)
         if slope >= 0.0:
             break  # nothing to gain
         steps += 1
         change = product(blocks, step, threads=threads)
-        size, trial = 1.0, np.inf
-        for _ in range(_TRIALS):
-            trial = objective(change, step, size)
-            if trial <= value + 1e-4 * size * slope:
-                break
-            size *= _SHRINK
-        else:
+        size, trial = _line_search(
+            functools.partial(objective, change, step), value, slope, solver.longest_step
+        )
+        if size == 0.0:
             converged = -slope <= _ENOUGH * max(1.0, abs(value))  # float32 has nothing left to gain
             break
-        while 1.0 <= size < longest_step:
-            farther = objective(change, step, 2.0 * size)
-            if farther >= trial:
-                break
-            size, trial = 2.0 * size, farther
         w = w + np.float32(size) * step
         f = f + np.float32(size) * change
         gain, value = value - trial, trial
         if gain <= _ENOUGH * max(1.0, abs(value)):
             break
     return WarmFit(w, 1.0 / diagonal, diagonal - precision, value, at_start, steps, converged)
+
+
+def _line_search(
+    objective: Callable[[float], float], value: float, slope: float, longest: float
+) -> tuple[float, float]:
+    """How far to go along a step, and the objective there; 0 and the old value if nothing better was found.
+
+    Args:
+        objective: Of the share of the step that is taken.
+        value, slope: The objective and its derivative at a share of 0.
+        longest: The largest share.
+    """
+    size = 1.0
+    for _ in range(_TRIALS):
+        trial = objective(size)
+        if trial <= value + 1e-4 * size * slope:
+            break
+        size *= _SHRINK
+    else:
+        return 0.0, value
+    while 1.0 <= size < longest:
+        farther = objective(2.0 * size)
+        if farther >= trial:
+            break
+        size, trial = 2.0 * size, farther
+    return size, trial
 
 
 def _conjugate_gradient(apply, rhs: Float32, diagonal: Float32, n_steps: int) -> Float32:
@@ -148,6 +178,7 @@ def _conjugate_gradient(apply, rhs: Float32, diagonal: Float32, n_steps: int) ->
 
 @nb.njit(nogil=True, error_model="numpy", cache=True)
 def _terms(f, y, c, least):
+    """(N,) first derivative of each row's loss in f, and (N,) a curvature with which no step overshoots."""
     residual = np.empty(len(f), np.float32)
     curvature = np.empty(len(f), np.float32)
     one, half = np.float32(1), np.float32(0.5)
@@ -165,6 +196,7 @@ def _terms(f, y, c, least):
 
 @nb.njit(nogil=True, error_model="numpy", cache=True)
 def _loss(f, change, size, y, c):
+    """Sum of the rows' losses at f + size * change, nats."""
     total = 0.0
     for i in range(len(f)):
         x = f[i] + size * change[i]

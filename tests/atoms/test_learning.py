@@ -23,7 +23,7 @@ from potserver.atoms.learning import (
 from potserver.domain.kernel_map import KernelMap
 from potserver.domain.types import Scan, yaw_pose
 from potserver.errors import EmptyError, SettingsError, SolverError
-from potserver.numerics.abhm import AbhmPosterior, AbhmSettings
+from potserver.numerics.abhm import AbhmOptions, AbhmPosterior
 from potserver.numerics.beams import label_beams
 
 SETTINGS = LearningSettings(
@@ -202,8 +202,8 @@ def test_a_sector_that_diverges_makes_no_atom_and_is_told(monkeypatch: pytest.Mo
 def test_no_more_points_and_kernels_than_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
     given = {}
 
-    def fit(points, occupied, hinge, gamma, settings, **options) -> None:
-        given.update(points=points, occupied=occupied, hinge=hinge, settings=settings, **options)
+    def fit(points, occupied, start, options, **more) -> None:
+        given.update(points=points, occupied=occupied, hinge=start.hinge, options=options, **more)
 
     monkeypatch.setattr(learning, "fit_abhm", fit)
     rng = np.random.default_rng(0)
@@ -235,7 +235,7 @@ def test_the_learners_settings_are_passed_on() -> None:
         "batch": 11,
         "learning_rate": 0.02,
     }
-    assert LearningSettings(**changed).abhm == AbhmSettings(**changed)
+    assert LearningSettings(**changed).abhm == AbhmOptions(**changed)
 
 
 @pytest.mark.parametrize(

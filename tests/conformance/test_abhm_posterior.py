@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 from scipy import optimize, special
 from scipy.stats import qmc
 
-from potserver.numerics.abhm import AbhmPosterior, AbhmSettings, fit_abhm
+from potserver.numerics.abhm import AbhmOptions, AbhmPosterior, AbhmStart, fit_abhm
 
 Float64 = NDArray[np.float64]
 
 # full batches, and many epochs of the dispersions: what is compared is their optimum, not how near a few epochs come
-SETTINGS = AbhmSettings(max_epochs=10, dispersion_epochs=16, steps=25, batch=10_000)
+SETTINGS = AbhmOptions(max_epochs=10, dispersion_epochs=16, steps=25, batch=10_000)
 
 
 class World(NamedTuple):
@@ -63,11 +63,11 @@ def _world(n_kernels: int, n_points: int) -> World:
 
 
 @functools.cache
-def _learned(
-    n_kernels: int, n_points: int, seed: int = 0, settings: AbhmSettings = SETTINGS
-) -> AbhmPosterior:
+def _learned(n_kernels: int, n_points: int, seed: int = 0, settings: AbhmOptions = SETTINGS) -> AbhmPosterior:
     world = _world(n_kernels, n_points)
-    return fit_abhm(world.points, world.occupied, world.start, world.start_gamma, settings, seed=seed)
+    return fit_abhm(
+        world.points, world.occupied, AbhmStart(world.start, world.start_gamma), settings, seed=seed
+    )
 
 
 @functools.cache

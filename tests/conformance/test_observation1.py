@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 
 from potserver.atoms.learning import beam_weights
 from potserver.domain.types import Float64
-from potserver.numerics.abhm import AbhmSettings, fit_abhm
+from potserver.numerics.abhm import AbhmOptions, AbhmStart, fit_abhm
 from tests.conformance.learned import SETTINGS, TOWNS, LearnedSector, auc, learned_town
 
 _NEAR, _FAR = 0.5, 1.5  # length scales from the nearest hit: at a surface, and away from all
@@ -84,7 +84,8 @@ def _learned_with_unseen_space(name: str) -> _Box:
         axes[2] = np.zeros(1)
     hinge = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
     fit = fit_abhm(
-        points, occupied, hinge, np.full(len(hinge), 0.5 / spacing**2), AbhmSettings(batch=800, steps=25, dispersion_epochs=0),
+        points, occupied, AbhmStart(hinge, np.full(len(hinge), 0.5 / spacing**2)),
+        AbhmOptions(batch=800, steps=25, dispersion_epochs=0),
         sample_weight=beam_weights(occupied, SETTINGS.free_per_beam),
     )  # fmt: skip
     return _Box(fit.weight_var, np.asarray(cKDTree(points).query(fit.hinge_mean)[0]), spacing)

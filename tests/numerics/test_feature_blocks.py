@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import itertools
-
 import numpy as np
 import pytest
 
 from potserver.numerics import feature_blocks as fb
-from potserver.numerics.cubes import sort_into_cubes
 from potserver.numerics.feature_blocks import feature_blocks
 
 
@@ -82,19 +79,3 @@ def test_nothing(n: int, k: int) -> None:
     assert len(fb.product(blocks, np.zeros(k, np.float32))) == n
     assert len(fb.gradient_and_diagonal(blocks, np.zeros(n, np.float32), np.zeros(n, np.float32))[0]) == k
     assert len(fb.normal_product(blocks, np.zeros(n, np.float32), np.zeros(k, np.float32))) == k
-
-
-@pytest.mark.parametrize("scale", [1.0, 1e-3, 1e6])
-def test_cubes_hold_neighbours_together(scale: float) -> None:
-    points = np.random.default_rng(0).uniform(-5, 5, (2000, 3)) * scale
-    order, cuts, groups = sort_into_cubes(points, 1.0)
-    np.testing.assert_array_equal(np.sort(order), np.arange(2000))
-    assert cuts[0] == 0
-    assert cuts[-1] == 2000
-    assert groups[0] == 0
-    assert groups[-1] == len(cuts) - 1
-    assert (np.diff(cuts) > 0).all()
-    assert (np.diff(groups) > 0).all()
-    if scale == 1.0:
-        for a, b in itertools.pairwise(cuts):
-            assert (np.ptp(points[order[a:b]], axis=0) <= 1.0).all()

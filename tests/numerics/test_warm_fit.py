@@ -7,7 +7,7 @@ import pytest
 import scipy.optimize
 
 from potserver.numerics.feature_blocks import feature_blocks
-from potserver.numerics.warm_fit import warm_fit
+from potserver.numerics.warm_fit import Prior, Solver, warm_fit
 
 K, N = 60, 700
 
@@ -53,9 +53,7 @@ def _optimum(case, free=slice(None), fixed=None) -> np.ndarray:
 
 def test_many_steps_end_at_the_optimum(case) -> None:
     blocks, phi, labels, counts, mean, var = case
-    fit = warm_fit(
-        blocks, labels, counts, mean, var, np.zeros(K, np.float32), n_newton=40, n_conjugate_gradient=60
-    )
+    fit = warm_fit(blocks, labels, counts, Prior(mean, var), np.zeros(K, np.float32), Solver(40, 60))
     assert fit.converged
     assert fit.objective <= _objective(case, _optimum(case)) * (1 + 1e-4)
     np.testing.assert_allclose(fit.objective, _objective(case, fit.weights), rtol=1e-4)
@@ -71,8 +69,7 @@ def test_many_steps_end_at_the_optimum(case) -> None:
 def test_longer_steps_end_at_the_same_optimum(case, longest: float) -> None:
     blocks, _, labels, counts, mean, var = case
     fit = warm_fit(
-        blocks, labels, counts, mean, var, np.zeros(K, np.float32), n_newton=40, n_conjugate_gradient=60,
-        longest_step=longest,
+        blocks, labels, counts, Prior(mean, var), np.zeros(K, np.float32), Solver(40, 60, longest_step=longest),
     )  # fmt: skip
     assert fit.converged
     assert fit.objective <= _objective(case, _optimum(case)) * (1 + 1e-4)
@@ -85,8 +82,7 @@ def test_where_labels_part_cleanly_one_longer_step_goes_farther_than_two(case) -
 
     def after(n: int, longest: float) -> float:
         return warm_fit(
-            blocks, clean, counts, mean, wide, np.zeros(K, np.float32), n_newton=n, n_conjugate_gradient=20,
-            longest_step=longest,
+            blocks, clean, counts, Prior(mean, wide), np.zeros(K, np.float32), Solver(n, 20, longest),
         ).objective  # fmt: skip
 
     assert after(1, 4.0) < after(2, 1.0) < after(1, 1.0)
@@ -95,7 +91,7 @@ def test_where_labels_part_cleanly_one_longer_step_goes_farther_than_two(case) -
 def test_few_steps_from_near_the_optimum_stay_there(case) -> None:
     blocks, _, labels, counts, mean, var = case
     best = _optimum(case).astype(np.float32)
-    fit = warm_fit(blocks, labels, counts, mean, var, best)
+    fit = warm_fit(blocks, labels, counts, Prior(mean, var), best)
     assert fit.objective <= fit.objective_at_start
     np.testing.assert_allclose(fit.objective_at_start, _objective(case, best), rtol=1e-5)
     np.testing.assert_allclose(fit.weights, best, atol=0.05)
@@ -109,7 +105,7 @@ def test_rows_that_are_surely_wrong_do_not_get_it_stuck(case, surely: float) -> 
     zeros = np.zeros(K, np.float32)
     weights = start
     for _ in range(30):
-        fit = warm_fit(blocks, np.zeros(N, bool), counts, zeros, var, weights)
+        fit = warm_fit(blocks, np.zeros(N, bool), counts, Prior(zeros, var), weights)
         assert fit.converged
         assert fit.objective <= fit.objective_at_start
         weights = fit.weights
@@ -122,7 +118,7 @@ def test_held_weights_are_held_and_still_count(case) -> None:
     blocks, _, labels, counts, mean, var = case
     free = np.arange(K) % 3 > 0
     start = np.where(free, 0.0, 2.0).astype(np.float32)
-    fit = warm_fit(blocks, labels, counts, mean, var, start, free=free, n_newton=40, n_conjugate_gradient=60)
+    fit = warm_fit(blocks, labels, counts, Prior(mean, var), start, Solver(40, 60), free=free)
     np.testing.assert_array_equal(fit.weights[~free], start[~free])
     best = _optimum(case, free, start)
     assert _objective(case, fit.weights) <= _objective(case, best) * (1 + 1e-4)
@@ -130,7 +126,7 @@ def test_held_weights_are_held_and_still_count(case) -> None:
 
 def test_the_same_to_the_bit_on_any_number_of_threads(case) -> None:
     blocks, _, labels, counts, mean, var = case
-    one, other = (warm_fit(blocks, labels, counts, mean, var, mean, threads=t) for t in (1, 4))
+    one, other = (warm_fit(blocks, labels, counts, Prior(mean, var), mean, threads=t) for t in (1, 4))
     np.testing.assert_array_equal(one.weights, other.weights)
     np.testing.assert_array_equal(one.var, other.var)
 
@@ -138,7 +134,9 @@ def test_the_same_to_the_bit_on_any_number_of_threads(case) -> None:
 def test_without_data_weights_go_to_their_prior() -> None:
     blocks = feature_blocks(np.zeros((0, 3)), np.zeros((2, 3)), np.ones(2), edge_m=1.0, cut=0.02)
     mean, var = np.array([1.0, -2.0], np.float32), np.array([4.0, 9.0], np.float32)
-    fit = warm_fit(blocks, np.zeros(0, bool), np.zeros(0, np.float32), mean, var, np.zeros(2, np.float32))
+    fit = warm_fit(
+        blocks, np.zeros(0, bool), np.zeros(0, np.float32), Prior(mean, var), np.zeros(2, np.float32)
+    )
     np.testing.assert_allclose(fit.weights, mean, atol=1e-5)
     np.testing.assert_allclose(fit.var, var, rtol=1e-5)
     np.testing.assert_array_equal(fit.support, 0.0)
@@ -147,4 +145,4 @@ def test_without_data_weights_go_to_their_prior() -> None:
 def test_nothing_at_all() -> None:
     blocks = feature_blocks(np.zeros((0, 3)), np.zeros((0, 3)), np.ones(0), edge_m=1.0, cut=0.02)
     none = np.zeros(0, np.float32)
-    assert len(warm_fit(blocks, np.zeros(0, bool), none, none, none, none).weights) == 0
+    assert len(warm_fit(blocks, np.zeros(0, bool), none, Prior(none, none), none).weights) == 0

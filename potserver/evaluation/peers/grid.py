@@ -15,7 +15,7 @@ from potserver.evaluation.mappers import Mapper, Size, kernel_bytes
 from potserver.mapping.placing import kernels_at
 from potserver.numerics.feature_blocks import feature_blocks
 from potserver.numerics.lattice_nodes import new_nodes
-from potserver.numerics.warm_fit import warm_fit
+from potserver.numerics.warm_fit import Prior, Solver, warm_fit
 
 _SAMPLES = 200_000  # of all scans together: what a batch solve can hold
 _FREE_A_BEAM = 2
@@ -74,9 +74,8 @@ class GridMap(Mapper):
         )  # fmt: skip
         counts = np.ones(len(self._points), np.float32)
         solved = warm_fit(
-            blocks, self._occupied, counts, kernels.weight_mean, kernels.weight_var, kernels.weight_mean,
-            n_newton=_NEWTON_STEPS, n_conjugate_gradient=_GRADIENT_STEPS, least_curvature=_LEAST_CURVATURE,
-            threads=self._threads,
+            blocks, self._occupied, counts, Prior(kernels.weight_mean, kernels.weight_var), kernels.weight_mean,
+            Solver(_NEWTON_STEPS, _GRADIENT_STEPS, least_curvature=_LEAST_CURVATURE), threads=self._threads,
         )  # fmt: skip
         self._map = KernelMap(
             kernels.replace(weight_mean=solved.weights, weight_var=solved.var),

@@ -1,0 +1,277 @@
+"""Rows of evidence: how samples are added, where rows stand, what they count, and how they give way to newer ones.
+
+A row belongs to one voxel, one label and one source (a robot). It holds the weight of the samples that fell there, and the
+weighted sum of their positions relative to the voxel's centre. So a row stands at the mean of its samples, rows of two maps can
+be added, and a source's samples can be taken off again. Hits have voxels of half the resolution, free samples voxels of the
+resolution. There are at most as many rows as voxels times labels times sources.
+
+All functions are pure but for `forget`, which scales sums in place.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numba as nb
+import numpy as np
+from numpy.typing import NDArray
+
+from potserver.numerics.arrays import Bool, Float32, Float64, Int16, Int32, Int64
+from potserver.numerics.voxel_hash import empty_table, enter, find, pack
+
+_LEAST_WEIGHT = 1e-3  # a row with less is taken for empty
+_INSIDE = 0.5 - 1e-6  # voxels: how far from the centre a row may stand
+
+
+class Rows(NamedTuple):
+    """R pseudo-data in one frame."""
+
+    voxel: Int32  # (R, 3) voxel numbers from the frame's origin, in voxels of the resolution (free) or half of it (hits)
+    occupied: Bool  # (R,) label
+    sums: Float32  # (R, 4) sum of w (x - centre) for each axis, m; sum of w
+    source: Int16  # (R,) number of the robot that saw it
+
+    @staticmethod
+    def empty() -> Rows:
+        """No rows."""
+        return Rows(
+            np.zeros((0, 3), np.int32), np.zeros(0, bool), np.zeros((0, 4), np.float32), np.zeros(0, np.int16)
+        )
+
+    @staticmethod
+    def concatenate(sets: list[Rows]) -> Rows:
+        """All rows, in order."""
+        return Rows(*(np.concatenate(parts) for parts in zip(*sets, strict=True))) if sets else Rows.empty()
+
+    def take(self, index: NDArray[np.intp] | Bool | slice) -> Rows:
+        """The rows that a numpy index picks."""
+        return Rows(self.voxel[index], self.occupied[index], self.sums[index], self.source[index])
+
+
+class Added(NamedTuple):
+    """Rows after samples were added."""
+
+    rows: Rows  # the old ones first, in their order
+    weight: Float32  # (R,) what each row gained
+
+
+class Filled(NamedTuple):
+    """Rows after samples were added, with the hash table (see `voxel_hash`) of one source's rows."""
+
+    rows: Rows  # the old ones first, in their order
+    weight: Float32  # (R,) what each row gained
+    table: Int32
+    keys: Int64  # one a row; undefined for rows of other sources
+
+
+def add(
+    rows: Rows,
+    points: Float64,
+    occupied: Bool,
+    weight: Float64 | Float32,
+    fine_m: float,
+    source: int = 0,
+) -> Added:
+    """Add a source's weighted samples to the rows.
+
+    A negative weight takes samples off; a row whose weight would fall below zero is left empty.
+
+    Args:
+        rows: Each voxel, label and source once.
+        points: (N, 3) m, in the rows' frame.
+        occupied: (N,) labels.
+        weight: (N,) of each sample.
+        fine_m: The resolution.
+        source: Who saw them; rows of other sources stay as they are.
+    """
+    filled = fill(rows, points, occupied, weight, fine_m, source)
+    return Added(filled.rows, filled.weight)
+
+
+def fill(
+    rows: Rows,
+    points: Float64,
+    occupied: Bool,
+    weight: Float64 | Float32,
+    fine_m: float,
+    source: int,
+) -> Filled:
+    """`add`, for callers that go on looking for the source's rows by voxel."""
+    n_old, n = len(rows.occupied), len(points)
+    voxel = np.empty((n_old + n, 3), np.int32)
+    label = np.empty(n_old + n, bool)
+    sums = np.zeros((n_old + n, 4), np.float32)
+    voxel[:n_old], label[:n_old], sums[:n_old] = rows.voxel, rows.occupied, rows.sums
+    sources = np.full(n_old + n, source, np.int16)
+    sources[:n_old] = rows.source
+    room = Rows(voxel, label, sums, sources)
+    gained = np.zeros(n_old + n, np.float32)
+    keys, table = np.empty(n_old + n, np.int64), empty_table(n_old + n)
+    used = _add(
+        room, gained, n_old, np.ascontiguousarray(points), occupied, np.asarray(weight, np.float64), fine_m, source,
+        table, keys,
+    )  # fmt: skip
+    return Filled(room.take(slice(used)), gained[:used], table, keys)
+
+
+def positions(rows: Rows, fine_m: float) -> Float64:
+    """(R, 3) m: where the rows stand, at the weighted means of their samples, strictly inside their voxels.
+
+    Without that limit rounding could put the mean of samples on a face, as in a planar map at z = 0, into the next voxel.
+    """
+    return np.asarray(_positions(rows.voxel, rows.occupied, rows.sums, fine_m), np.float64)
+
+
+@nb.njit(nogil=True, error_model="numpy", cache=True)
+def _positions(voxel, occupied, sums, fine_m):
+    out = np.empty((len(occupied), 3))
+    for r in range(len(occupied)):
+        edge = 0.5 * fine_m if occupied[r] else fine_m
+        weight = max(sums[r, 3], np.float32(1e-9))
+        for c in range(3):
+            offset = min(max(np.float64(sums[r, c] / weight), -_INSIDE * edge), _INSIDE * edge)
+            out[r, c] = (voxel[r, c] + 0.5) * edge + offset
+    return out
+
+
+def is_alive(rows: Rows) -> Bool:
+    """(R,) which rows have weight left."""
+    return rows.sums[:, 3] > _LEAST_WEIGHT
+
+
+def tile_of(rows: Rows, voxels: int, size: Int64) -> tuple[Int64, Int32]:
+    """Which tile of a box each row lies in, and its voxel counted from that tile's corner.
+
+    Args:
+        rows: In a frame whose origin is the box's lower corner.
+        voxels: Of free space along a tile's edge; of hits there are twice as many.
+        size: (3,) tiles along the box's axes.
+    Returns:
+        (R,) numbers of the tiles, z fastest, and (R, 3) voxels.
+    """
+    return _tile_of(rows.voxel, rows.occupied, voxels, size)
+
+
+@nb.njit(nogil=True, error_model="numpy", cache=True)
+def _tile_of(voxel, occupied, voxels, size):
+    number = np.zeros(len(occupied), np.int64)
+    local = np.empty((len(occupied), 3), np.int32)
+    for r in range(len(occupied)):
+        edge = 2 * voxels if occupied[r] else voxels
+        for c in range(3):
+            tile = voxel[r, c] // edge
+            number[r] = number[r] * size[c] + tile
+            local[r, c] = voxel[r, c] - tile * edge
+    return number, local
+
+
+class Cells(NamedTuple):
+    """The cell of each row: a voxel of free space and the voxels of hits in it. Evidence saturates and is forgotten by cell."""
+
+    number: Int64  # (R,) from 0
+    n: int
+
+
+def cells(rows: Rows) -> Cells:
+    """Number the cells that have rows."""
+    number, n = _cells(rows.voxel, rows.occupied, empty_table(len(rows.occupied)))
+    return Cells(number, n)
+
+
+def forget(sums: Float32, gained: Float32, cells: Cells, limit: float) -> None:
+    """Scale old evidence down, in place, so that no cell keeps more than `limit` of weight. Cells without new evidence stay.
+
+    Args:
+        sums: (R, 4) of the rows, what was gained included.
+        gained: (R,) the part of the weights that is new.
+        cells: Of the rows.
+        limit: Weight of a cell. New evidence that exceeds it alone is scaled down to it.
+    """
+    _forget(sums, gained, cells.number, cells.n, limit)
+
+
+def counts(sums: Float32, cells: Cells, saturation: float) -> Float32:
+    """(R,) what each row counts in a fit: its weight / (1 + weight of its cell / saturation).
+
+    Looks at one place repeat each other. So a cell counts for less than `saturation` looks, shared among its rows by weight.
+    """
+    weight = np.maximum(sums[:, 3], np.float32(0))
+    total = np.bincount(cells.number, weight, cells.n)
+    return (weight / (1.0 + total[cells.number] / saturation)).astype(np.float32)
+
+
+def decay(rows: Rows, factor: float) -> Rows:
+    """All weights times a factor, e.g. for their age. A factor of 1 returns the rows themselves."""
+    if factor == 1.0:
+        return rows
+    return rows._replace(sums=rows.sums * np.float32(factor))
+
+
+@nb.njit(nogil=True, error_model="numpy", cache=True)
+def _add(rows, gained, n, points, occupied, weight, fine_m, source, table, keys):
+    """Fill `rows` from row n on, in place, and `table` and `keys` with the source's rows; how many rows are used."""
+    voxel, label, sums, sources = rows
+    for r in range(n):
+        if sources[r] == source:
+            keys[r] = pack(label[r], voxel[r, 0], voxel[r, 1], voxel[r, 2])
+            table[find(table, keys, keys[r])] = r
+    cell = np.empty(3, np.int64)
+    for i in range(len(points)):
+        edge = 0.5 * fine_m if occupied[i] else fine_m
+        for c in range(3):
+            cell[c] = np.int64(np.floor(points[i, c] / edge))
+        key = pack(occupied[i], cell[0], cell[1], cell[2])
+        place = find(table, keys, key)
+        r = table[place]
+        if r < 0:
+            if weight[i] <= 0.0:
+                continue  # nothing to take off
+            r = n
+            table[place] = r
+            keys[r] = key
+            label[r] = occupied[i]
+            for c in range(3):
+                voxel[r, c] = cell[c]
+            n += 1
+        w = weight[i]
+        if w < 0.0 and sums[r, 3] + w <= _LEAST_WEIGHT:
+            gained[r] -= sums[r, 3]
+            sums[r, :] = 0.0
+            continue
+        for c in range(3):
+            sums[r, c] += w * (points[i, c] - (cell[c] + 0.5) * edge)
+        sums[r, 3] += w
+        gained[r] += w
+    return n
+
+
+@nb.njit(nogil=True, error_model="numpy", cache=True)
+def _cells(voxel, occupied, table):
+    n_rows = len(occupied)
+    number = np.empty(n_rows, np.int64)
+    keys = np.empty(n_rows, np.int64)
+    n = 0
+    for r in range(n_rows):
+        shift = 1 if occupied[r] else 0
+        key = pack(0, voxel[r, 0] >> shift, voxel[r, 1] >> shift, voxel[r, 2] >> shift)
+        number[r] = enter(table, keys, n, key)
+        n = max(n, number[r] + 1)
+    return number, n
+
+
+@nb.njit(nogil=True, error_model="numpy", cache=True)
+def _forget(sums, gained, cell, n_cells, limit):
+    total = np.zeros(n_cells)
+    new = np.zeros(n_cells)
+    for r in range(len(cell)):
+        total[cell[r]] += sums[r, 3]
+        new[cell[r]] += max(gained[r], 0.0)
+    for r in range(len(cell)):
+        t, g = total[cell[r]], new[cell[r]]
+        if g <= 0.0 or t <= limit or sums[r, 3] <= 0.0:
+            continue
+        keep_new = min(1.0, limit / g)
+        keep_old = max(limit - g, 0.0) / (t - g) if t - g > 1e-9 else 0.0
+        gain = max(gained[r], 0.0)
+        # one factor for the row: its old and its new samples share one mean
+        sums[r] *= ((sums[r, 3] - gain) * keep_old + gain * keep_new) / sums[r, 3]

@@ -1,0 +1,67 @@
+"""How evidence is added and taken off, saturates and is forgotten."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from potserver.numerics.evidence import add, cells, counts, decay, forget, is_alive, positions
+from tests.numerics.evidence.samples import FINE_M, rows_of
+
+
+def test_taking_off_more_than_there_is_leaves_nothing() -> None:
+    rows, gained = add(
+        rows_of([[0.1, 0.1, 0.1]], True), np.full((1, 3), 0.1), np.array([True]), np.array([-5.0]), FINE_M
+    )
+    assert rows.sums[0, 3] == 0.0
+    assert gained[0] == -1.0
+    assert not is_alive(rows).any()
+
+
+def test_taking_off_what_never_was_adds_no_row() -> None:
+    rows, _ = add(
+        rows_of([[0.1, 0.1, 0.1]], True), np.full((1, 3), 9.0), np.array([True]), np.array([-1.0]), FINE_M
+    )
+    assert len(rows.occupied) == 1
+
+
+def test_a_cell_is_a_free_voxel_and_the_hits_in_it() -> None:
+    rows = rows_of(
+        [[0.1, 0.1, 0.1], [0.3, 0.3, 0.3], [0.2, 0.2, 0.1], [0.5, 0.1, 0.1]], [True, True, False, True]
+    )
+    number, n = cells(rows)
+    assert n == 2
+    assert number[0] == number[1] == number[2] != number[3]
+
+
+@pytest.mark.parametrize("looks", [1, 20, 400])
+def test_looks_at_one_place_count_less_and_less(looks: int) -> None:
+    points = np.tile([[0.1, 0.1, 0.1], [0.2, 0.2, 0.3]], (looks, 1))
+    rows = rows_of(points, np.tile([True, False], looks))
+    count = counts(rows.sums, cells(rows), 20.0)
+    np.testing.assert_allclose(count, looks / (1 + 2 * looks / 20.0), rtol=1e-5)
+    assert count.sum() < 20.0
+
+
+def test_old_evidence_gives_way_to_new() -> None:
+    rows = rows_of(np.tile([0.1, 0.1, 0.1], (100, 1)), True)
+    rows, gained = add(rows, np.tile([0.15, 0.1, 0.1], (30, 1)), np.zeros(30, bool), np.ones(30), FINE_M)
+    where = positions(rows, FINE_M)
+    forget(rows.sums, gained, cells(rows), 50.0)
+    np.testing.assert_allclose(rows.sums[:, 3], [20.0, 30.0], rtol=1e-5)
+    np.testing.assert_allclose(positions(rows, FINE_M), where, atol=1e-6)
+    # one scan alone above the limit is scaled itself
+    rows, gained = add(rows, np.tile([0.15, 0.1, 0.1], (200, 1)), np.zeros(200, bool), np.ones(200), FINE_M)
+    forget(rows.sums, gained, cells(rows), 50.0)
+    np.testing.assert_allclose(rows.sums[:, 3], [0.0, 50.0], atol=1e-3)
+
+
+def test_cells_without_new_evidence_forget_nothing() -> None:
+    rows = rows_of(np.tile([0.1, 0.1, 0.1], (100, 1)), True)
+    forget(rows.sums, np.zeros(1, np.float32), cells(rows), 50.0)
+    assert rows.sums[0, 3] == 100.0
+
+
+def test_decay_scales_all() -> None:
+    rows = rows_of([[0.1, 0.1, 0.1], [0.9, 0.1, 0.1]], [True, False])
+    np.testing.assert_allclose(decay(rows, 0.5).sums, 0.5 * rows.sums)
