@@ -73,64 +73,58 @@ class MapNode:
             newest_stamps: Of its robots, ns, from before.
             shared: With the other maps of the server.
         """
-        settings, limits = shared.settings, shared.settings.limits
+        settings, limits, health = shared.settings, shared.settings.limits, shared.health
         self.map_id, self.mapper = mapper.map_id, mapper
-        self._session = shared.session
-        self._keys = keys.MapKeys(settings.root, self.map_id)
+        self._session, self._keys = shared.session, keys.MapKeys(settings.root, mapper.map_id)
         self._tokens: collections.deque[ServerToken] = collections.deque()
-        queued_bytes = QUEUE_MESSAGES * limits.max_cloud_bytes
-        self.intake = IntakeQueue(max_queued=settings.intake.max_queued, max_queued_bytes=queued_bytes)
-        self.prompt = Outbox(
-            f"{self.map_id}-prompt", max_pending=_PROMPT_TASKS, max_pending_bytes=queued_bytes
-        )
-        self.bulk = Outbox(f"{self.map_id}-bulk", max_pending=_BULK_TASKS, max_pending_bytes=queued_bytes)
+        n_bytes = QUEUE_MESSAGES * limits.max_cloud_bytes
+        self.intake = IntakeQueue(max_queued=settings.intake.max_queued, max_queued_bytes=n_bytes)
+        self.prompt = Outbox(f"{self.map_id}-prompt", max_pending=_PROMPT_TASKS, max_pending_bytes=n_bytes)
+        self.bulk = Outbox(f"{self.map_id}-bulk", max_pending=_BULK_TASKS, max_pending_bytes=n_bytes)
         self._receipts = ReceiptSender(
             self._session,
             self._keys,
             mapper=mapper,
             intake=self.intake,
-            health=shared.health,
+            health=health,
             limits=limits,
             prompt=self.prompt,
             bulk=self.bulk,
         )
-        self.robots = RobotWatch(
-            self._session, self._keys, health=shared.health, max_robots=limits.max_robots
-        )
-        self._declarations = [self.robots, *self._declare(keeper, newest_stamps, shared)]
-        self._threads = [
-            spawn(f"{self.map_id}-writer", self._writer.run),
-            *(spawn(f"{self.map_id}-{type(d).__name__}", d.run) for d in self._declarations),
-        ]
-
-    def _declare(
-        self, keeper: Keeper, newest_stamps: Mapping[str, int], shared: Shared
-    ) -> list[_Declaration]:
-        """The way in, for clouds and poses, and the questions."""
-        settings, limits, health = shared.settings, shared.settings.limits, shared.health
-        session, map_keys, allowed = self._session, self._keys, frozenset(settings.intake.robots)
-        max_future_s = settings.intake.max_future_s
         poses = PoseBuffer(
             max_gap_s=settings.poses.max_gap_s,
-            max_future_s=max_future_s,
+            max_future_s=settings.intake.max_future_s,
             max_robots=limits.max_robots,
             wait_s=WAIT_S,
         )
-        door = CloudDoor(self.intake, self._receipts, health, limits, allowed)
-        self._writer = MapWriter(
-            self.mapper,
+        writer = MapWriter(
+            mapper,
             keeper,
             stamps=StampOrder(
                 newest_stamps,
                 allow_old=settings.intake.allow_old_stamps,
-                max_future_s=max_future_s,
+                max_future_s=settings.intake.max_future_s,
                 max_robots=limits.max_robots,
             ),
             intake=self.intake,
-            reader=CloudReader(limits, poses, allowed),
+            reader=CloudReader(limits, poses, frozenset(settings.intake.robots)),
             receipts=self._receipts,
             health=health,
         )
+        self.robots = RobotWatch(self._session, self._keys, health=health, max_robots=limits.max_robots)
+        self._declarations = [self.robots, *self._declare(poses, writer, keeper.durable, shared)]
+        self._threads = [
+            spawn(f"{self.map_id}-writer", writer.run),
+            *(spawn(f"{self.map_id}-{type(d).__name__}", d.run) for d in self._declarations),
+        ]
+
+    def _declare(
+        self, poses: PoseBuffer, writer: MapWriter, durable: bool, shared: Shared
+    ) -> list[_Declaration]:
+        """The ways in, for poses, clouds, questions and control."""
+        settings, limits, health = shared.settings, shared.settings.limits, shared.health
+        session, map_keys, allowed = self._session, self._keys, frozenset(settings.intake.robots)
+        door = CloudDoor(self.intake, self._receipts, health, limits, allowed)
         served = Served(
             server_id=settings.server_id,
             map_id=self.map_id,
@@ -139,7 +133,7 @@ class MapNode:
             atoms=shared.atoms,
             health=health,
             limits=limits,
-            durable=keeper.durable,
+            durable=durable,
         )
         return [
             PoseSubscriber(session, map_keys, poses=poses, health=health, allowed_robots=allowed),
@@ -157,7 +151,7 @@ class MapNode:
                 map_keys,
                 served=served,
                 intake=self.intake,
-                writer=self._writer,
+                writer=writer,
                 withdraw=self.withdraw,
                 prompt=self.prompt,
             ),

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -29,27 +30,16 @@ BUG = "a bug of the server; the traceback is in its log"
 _BACKLOG = 64  # queries between Zenoh and our admission; admission takes microseconds
 
 
-class Queryable:
+class Queryable(ABC):
     """One declared key expression, and the thread's work that admits its queries.
 
     Args:
         session: Where it is declared.
         key_expr: What it answers.
-        admit: Called with each query; must not block. What it raises is handed to `refuse`.
-        refuse: Ends a query with an error.
         backlog: Queries between Zenoh and our admission.
     """
 
-    def __init__(
-        self,
-        session: zenoh.Session,
-        key_expr: str,
-        *,
-        admit: Callable[[zenoh.Query], None],
-        refuse: Callable[[zenoh.Query, PotserverError], None],
-        backlog: int = 4,
-    ) -> None:
-        self._admit, self._refuse = admit, refuse
+    def __init__(self, session: zenoh.Session, key_expr: str, *, backlog: int = 4) -> None:
         self._queryable = session.declare_queryable(
             key_expr, zenoh.handlers.FifoChannel(backlog), complete=True
         )
@@ -58,16 +48,24 @@ class Queryable:
         """Admit queries until undeclared, on a thread of our own."""
         for query in self._queryable:
             try:
-                self._admit(query)
+                self.admit(query)
             except PotserverError as error:
-                self._refuse(query, error)
+                self.refuse(query, error)
             except Exception:
                 log.exception("query_admission_failed", key=str(query.key_expr))
-                self._refuse(query, PotserverError(BUG))
+                self.refuse(query, PotserverError(BUG))
 
     def undeclare(self) -> None:
         """Take no more; ends `run`."""
         self._queryable.undeclare()
+
+    @abstractmethod
+    def admit(self, query: zenoh.Query) -> None:
+        """Begin to answer a query, without blocking; what this raises is sent by `refuse`."""
+
+    @abstractmethod
+    def refuse(self, query: zenoh.Query, error: PotserverError) -> None:
+        """End a query with an error; from any thread."""
 
 
 def check_query(query: zenoh.Query, kind: type[messages.Message], max_bytes: int, what: str) -> int:
@@ -99,7 +97,7 @@ def reply_error(query: zenoh.Query, error: PotserverError) -> None:
         query.reply_err(wire.payload, encoding=wire.encoding)
 
 
-class MapQueryable:
+class MapQueryable(Queryable):
     """All `q/<op>` of one map."""
 
     def __init__(
@@ -124,19 +122,10 @@ class MapQueryable:
         self._keys, self._served, self._pool = map_keys, served, pool
         self._questions, self._integrate = {question.op: question for question in questions}, integrate
         self._ops = (INTEGRATE, *self._questions)
-        self._queryable = Queryable(
-            session, map_keys.query("*"), admit=self._admit, refuse=self._refuse, backlog=_BACKLOG
-        )
+        super().__init__(session, map_keys.query("*"), backlog=_BACKLOG)
 
-    def run(self) -> None:
-        """Admit queries until undeclared, on a thread of our own."""
-        self._queryable.run()
-
-    def undeclare(self) -> None:
-        """Take no more; ends `run`."""
-        self._queryable.undeclare()
-
-    def _admit(self, query: zenoh.Query) -> None:
+    def admit(self, query: zenoh.Query) -> None:
+        """Queue a query for a worker; a cloud goes to the writer."""
         self._served.health.count("queries.received")
         op = last_chunk(query.key_expr)
         if op == INTEGRATE:
@@ -149,7 +138,7 @@ class MapQueryable:
         self._pool.submit(
             QueryJob(
                 answer=lambda arrived_s: self._answer(query, question, arrived_s),
-                refuse=lambda error: self._refuse(query, error),
+                refuse=lambda error: self.refuse(query, error),
                 n_bytes=n_bytes,
                 is_short=question.is_short,
             )
@@ -191,7 +180,8 @@ class MapQueryable:
         for part in question.answer(asked, message):
             reply(query, key, encode(part))
 
-    def _refuse(self, query: zenoh.Query, error: PotserverError) -> None:
+    def refuse(self, query: zenoh.Query, error: PotserverError) -> None:
+        """Count and send what is wrong, at once."""
         with query:
             self._reply_error(query, error)
 

@@ -23,7 +23,7 @@ from potserver.codec.base import Wire, encode, encode_error
 from potserver.codec.clouds import UNKNOWN_SEQ, decode_cloud_head
 from potserver.codec.kernels import encode_kernels
 from potserver.domain.map_state import MapState
-from potserver.domain.types import MapUpdate, Scan, SectorMatch, TileChange
+from potserver.domain.types import MapUpdate, Scan, TileChange
 from potserver.errors import PotserverError, TooLargeError
 from potserver.health import Health
 from potserver.limits import Limits
@@ -214,7 +214,7 @@ def encode_accepted(
             n_kernels_added=int(update.n_kernels_added),
             n_kernels_transported=int(update.n_kernels_transported),
             map_kernels=int(update.map_kernels),
-            sectors=_sectors(update.sectors),
+            sectors=[messages.SectorReport(**match._asdict()) for match in update.sectors],
             kernels=encode_kernels(update.kernels, update.rule) if with_kernels else None,
         )
     )
@@ -250,7 +250,7 @@ def encode_params(map_id: str, scan: Scan, update: MapUpdate) -> Wire:
             stamp_ns=scan.stamp_ns,
             map_revision=int(update.map_revision),
             kernels=encode_kernels(update.kernels, update.rule),
-            sectors=_sectors(update.sectors),
+            sectors=[messages.SectorReport(**match._asdict()) for match in update.sectors],
         )
     )
 
@@ -269,23 +269,3 @@ def encode_revision(
             changed_tiles=[[int(i) for i in tile] for tile in changed.tiles],
         )
     )
-
-
-def _sectors(matches: list[SectorMatch]) -> list[messages.SectorReport]:
-    return [
-        messages.SectorReport(
-            azimuth_min_rad=float(m.azimuth_min_rad),
-            azimuth_max_rad=float(m.azimuth_max_rad),
-            n_hits=int(m.n_hits),
-            n_free=int(m.n_free),
-            atom_id=m.atom_id,
-            rotation_rad=float(m.rotation_rad),
-            w2_m2=float(m.w2_m2),
-            n_kernels=int(m.n_kernels),
-            converged=bool(m.converged),
-            marginal_error=float(m.marginal_error),
-            n_iterations=int(m.n_iterations),
-            reason=m.reason,
-        )
-        for m in matches
-    ]

@@ -29,13 +29,13 @@ class StatsPublisher:
     def __init__(
         self, session: zenoh.Session, key: str, encode_now: Callable[[], Wire], limits: Limits
     ) -> None:
-        self._key, self._encode_now, self._limits = key, encode_now, limits
+        self._encode_now = encode_now
         self._stop = threading.Event()
         # background: the first to go when a link is full
         self._publisher = session.declare_publisher(
             key, priority=zenoh.Priority.BACKGROUND, congestion_control=zenoh.CongestionControl.DROP
         )
-        self._queryable = Queryable(session, key, admit=self._answer, refuse=_refuse)
+        self._queryable = _StatsQueryable(session, key, encode_now, limits)
         self._threads = [
             spawn("stats-publisher", self._publish),
             spawn("stats-queryable", self._queryable.run),
@@ -59,17 +59,26 @@ class StatsPublisher:
             except Exception:
                 log.exception("stats_failed")
 
-    def _answer(self, query: zenoh.Query) -> None:
+
+class _StatsQueryable(Queryable):
+    """Answers at once: the counters are there, and nobody else waits behind."""
+
+    def __init__(
+        self, session: zenoh.Session, key: str, encode_now: Callable[[], Wire], limits: Limits
+    ) -> None:
+        self._key, self._encode_now, self._limits = key, encode_now, limits
+        super().__init__(session, key)
+
+    def admit(self, query: zenoh.Query) -> None:
         check_query(query, messages.StatsQuery, self._limits.max_query_bytes, "stats query")
         decode(payload_of(query), messages.StatsQuery)
         wire = self._encode_now()
         with query:
             reply(query, self._key, wire)
 
-
-def _refuse(query: zenoh.Query, error: PotserverError) -> None:
-    with query:
-        reply_error(query, error)
+    def refuse(self, query: zenoh.Query, error: PotserverError) -> None:
+        with query:
+            reply_error(query, error)
 
 
 def encode_stats(

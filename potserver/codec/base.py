@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 from collections.abc import Iterator
 from typing import Any, NamedTuple, TypeVar
 
@@ -100,3 +101,9 @@ def encode_error(error: PotserverError) -> Wire:
 def float32(array: NDArray[np.floating[Any]]) -> messages.Array:
     """Real numbers for the wire."""
     return wire.encode_array(np.asarray(array, np.float32))
+
+
+def float32_fields(record: Any) -> dict[str, Any]:
+    """The fields of a dataclass by name, its arrays as float32: for a message that has the same fields."""
+    values = {field.name: getattr(record, field.name) for field in dataclasses.fields(record)}
+    return {name: float32(v) if isinstance(v, np.ndarray) else v for name, v in values.items()}

@@ -27,6 +27,7 @@ from potserver.asking.params import Params
 from potserver.asking.points import Points
 from potserver.asking.rays import Rays
 from potserver.asking.risk import Risk
+from potserver.asking.tiles import PART_KERNELS
 from potserver.atoms.store import AtomStore
 from potserver.codec.atoms import encode_atom
 from potserver.codec.base import decode
@@ -187,6 +188,10 @@ def test_known_tiles_need_their_epoch() -> None:
     asked = decode_tiles(messages.TilesQuery(known=known, epoch=3)).known
     assert asked is not None
     assert (asked.epoch, asked.indices.shape, asked.revisions.shape) == (3, (1, 3), (1,))
+
+
+def test_askers_take_parts_of_our_size() -> None:
+    assert PART_KERNELS <= messages.MAX_PART_KERNELS
 
 
 def test_tiles_come_with_what_answers_need() -> None:

@@ -58,8 +58,8 @@ def _changed(served: Served, query: messages.AtomsQuery) -> messages.AtomsChange
         served.health.count(f"atoms.refused.{error.reason or error.code}")
         raise
     served.health.count(f"atoms.{verb}")
-    log.info(f"atom_{verb}", atom_id=change.atom_id, n_atoms=change.n_atoms, persisted=change.persisted)
-    return messages.AtomsChanged(atom_id=change.atom_id, n_atoms=change.n_atoms, persisted=change.persisted)
+    log.info(f"atom_{verb}", **change._asdict())
+    return messages.AtomsChanged(**change._asdict())
 
 
 # a change of the dictionary is rare, and short beside a grid

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 import time
 from collections.abc import Callable
-from typing import NamedTuple
 
 import numpy as np
 import zenoh
@@ -28,11 +28,12 @@ _FIELDS = ("name", "robot", "T_map_saved")  # of a request, that some verbs take
 Work = Callable[[], str]  # runs on the writer's thread; returns what was done, for people
 
 
-class Verb(NamedTuple):
+@dataclasses.dataclass(frozen=True, slots=True)
+class Verb:
     """What one verb takes and does."""
 
     work: Callable[[MapWriter, messages.ControlRequest], Work]
-    needs: dict[str, str] = {}  # noqa: RUF012 - a field, and what the refusal calls it; never changed
+    needs: dict[str, str] = dataclasses.field(default_factory=dict)  # a field, and what a refusal calls it
     takes: tuple[str, ...] = ()  # fields that may be left out
 
 
@@ -91,7 +92,7 @@ def work_of(verb: str, request: messages.ControlRequest, writer: MapWriter) -> W
     return VERBS[verb].work(writer, request)
 
 
-class ControlQueryable:
+class ControlQueryable(Queryable):
     """All `ctl/<verb>` of one map."""
 
     def __init__(
@@ -117,17 +118,10 @@ class ControlQueryable:
         """
         self._keys, self._served, self._intake, self._writer = map_keys, served, intake, writer
         self._withdraw, self._prompt = withdraw, prompt
-        self._queryable = Queryable(session, map_keys.control("*"), admit=self._admit, refuse=self._refuse)
+        super().__init__(session, map_keys.control("*"))
 
-    def run(self) -> None:
-        """Admit requests until undeclared, on a thread of our own."""
-        self._queryable.run()
-
-    def undeclare(self) -> None:
-        """Take no more; ends `run`."""
-        self._queryable.undeclare()
-
-    def _admit(self, query: zenoh.Query) -> None:
+    def admit(self, query: zenoh.Query) -> None:
+        """Queue the work of a verb behind the clouds before it."""
         verb = last_chunk(query.key_expr)
         if is_wild(query.key_expr):
             raise UnsupportedError(
@@ -148,13 +142,13 @@ class ControlQueryable:
                     )
                 self._done(query, verb, work())
             except PotserverError as error:
-                self._refuse(query, error)
+                self.refuse(query, error)
             except Exception:
                 log.exception("control_failed", key=self._keys.control(verb))
-                self._refuse(query, PotserverError(BUG))
+                self.refuse(query, PotserverError(BUG))
 
         self._intake.admit_barrier(
-            Barrier(run, lambda error: self._refuse(query, error)), is_last=verb == DRAIN
+            Barrier(run, lambda error: self.refuse(query, error)), is_last=verb == DRAIN
         )
         if verb == DRAIN:
             self._withdraw()
@@ -174,7 +168,8 @@ class ControlQueryable:
 
         self._prompt.post_now(send)
 
-    def _refuse(self, query: zenoh.Query, error: PotserverError) -> None:
+    def refuse(self, query: zenoh.Query, error: PotserverError) -> None:
+        """Count what is wrong; the outbox sends it."""
         verb = last_chunk(query.key_expr)
         self._served.health.count(f"control.{verb if verb in VERBS else 'unknown'}.{error.code}")
 

@@ -6,8 +6,8 @@ from collections.abc import Iterator
 
 from potschemas import messages
 from potserver.adapters.questions.question import Asked, Question
-from potserver.asking.rays import QUANTILES, RayReturns, Rays
-from potserver.codec.base import FLOATS, decode_array, float32
+from potserver.asking.rays import QUANTILES, Rays
+from potserver.codec.base import FLOATS, decode_array, float32_fields
 from potserver.domain.kernel_map import KernelMap
 from potserver.domain.types import Unknown
 from potserver.limits import Limits
@@ -31,23 +31,9 @@ def decode_rays(query: messages.RaysQuery) -> Rays:
     )
 
 
-def encode_returns(returns: RayReturns) -> messages.Rays:
-    """The reply."""
-    return messages.Rays(
-        hit_probability=float32(returns.hit_probability),
-        mean_m=float32(returns.mean_m),
-        std_m=float32(returns.std_m),
-        quantile_m=float32(returns.quantile_m),
-        unknown_range_m=float32(returns.unknown_range_m),
-        unknown_share=float32(returns.unknown_share),
-        step_m=returns.step_m,
-        map_revision=returns.map_revision,
-    )
-
-
 def _answer(asked: Asked, query: messages.RaysQuery) -> Iterator[messages.Message]:
     plan = decode_rays(query).plan(asked.snapshot, asked.limits)
-    yield encode_returns(plan.result(asked.parts(plan)))
+    yield messages.Rays(**float32_fields(plan.result(asked.parts(plan))))
 
 
 def _warm_up(kernels: KernelMap) -> None:

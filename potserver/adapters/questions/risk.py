@@ -9,8 +9,8 @@ import numpy as np
 from potschemas import messages
 from potschemas.messages import DType
 from potserver.adapters.questions.question import Asked, Question
-from potserver.asking.risk import PathRisk, Risk
-from potserver.codec.base import FLOATS, decode_array, float32
+from potserver.asking.risk import Risk
+from potserver.codec.base import FLOATS, decode_array, float32_fields
 from potserver.domain.kernel_map import KernelMap
 from potserver.domain.types import Unknown
 from potserver.limits import Limits
@@ -32,24 +32,9 @@ def decode_risk(query: messages.RiskQuery) -> Risk:
     )
 
 
-def encode_risk(risk: PathRisk) -> messages.Risk:
-    """The reply."""
-    return messages.Risk(
-        max_probability=float32(risk.max_probability),
-        union_probability=float32(risk.union_probability),
-        unknown_share=float32(risk.unknown_share),
-        path_max_probability=risk.path_max_probability,
-        path_union_probability=risk.path_union_probability,
-        path_unknown_share=risk.path_unknown_share,
-        n_cells=risk.n_cells,
-        resolution_m=risk.resolution_m,
-        map_revision=risk.map_revision,
-    )
-
-
 def _answer(asked: Asked, query: messages.RiskQuery) -> Iterator[messages.Message]:
     plan = decode_risk(query).plan(asked.snapshot, asked.limits)
-    yield encode_risk(plan.result(asked.parts(plan)))
+    yield messages.Risk(**float32_fields(plan.result(asked.parts(plan))))
 
 
 def _warm_up(kernels: KernelMap) -> None:
