@@ -74,7 +74,8 @@ def choose_tau(hinge: Float64, gamma: Float64, weight: Float64, variance: Float6
     what is cut begins.
     """
     rng = np.random.default_rng(0)
-    pick = rng.choice(len(hinge), min(_SAMPLES, len(hinge)), replace=False)
+    # of few kernels each is sampled several times: where one sample lies must not decide
+    pick = rng.choice(len(hinge), _SAMPLES, replace=len(hinge) < _SAMPLES)
     distance2 = np.where(
         np.arange(len(pick)) % 2 == 0, rng.chisquare(3, len(pick)) / 2.0, rng.uniform(0.0, _FRINGE, len(pick))
     )

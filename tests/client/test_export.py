@@ -19,6 +19,7 @@ from potclient.kernels import KernelSet
 from potclient.octomap import DEPTH, KEY_ORIGIN, read_bt
 from potclient.results import Grid
 from potschemas import messages
+from potschemas.answers import AnswerRule
 from potschemas.examples import examples
 
 Array = np.ndarray[Any, Any]
@@ -39,9 +40,7 @@ class HeldMap:
             gamma_rate=one,
             weight_mean=3 * one,
             weight_var=0.5 * one,
-            observed_activation=0.05,
-            prior_var=50.0,
-            residual_var=20.0,
+            rule=AnswerRule(prior_var=50.0, residual_var=20.0),
             map_revision=7,
         )
 

@@ -30,7 +30,9 @@ def name_of(path: Path) -> str:
 
 
 def is_compiled(function: ast.FunctionDef) -> bool:
-    return any("jit" in ast.unparse(d) or "intrinsic" in ast.unparse(d) for d in function.decorator_list)
+    return any(
+        word in ast.unparse(d) for d in function.decorator_list for word in ("jit", "inner_loop", "intrinsic")
+    )
 
 
 def body_lines(function: ast.FunctionDef) -> int:
