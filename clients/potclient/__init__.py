@@ -46,9 +46,10 @@ from potclient.feed import FeedOptions
 from potclient.kernels import KernelSet
 from potclient.link import Subscription
 from potclient.mirror import MapMirror, MirrorUpdate
+from potclient.occupancy import Grid, Occupancy
 from potclient.questions.rays import Rays
 from potclient.questions.risk import Risk
-from potclient.results import FeedCounts, Grid, Occupancy, Receipt, TransportedParams
+from potclient.results import FeedCounts, Receipt, TransportedParams
 from potclient.session import SessionOptions
 from potschemas import __version__
 

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
+from potclient.arrays import Float64
 from potclient.errors import UsageError
-from potclient.results import Float64
 from potschemas.keys import check_id
 from potschemas.messages import Unknown
 

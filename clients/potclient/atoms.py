@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
+from potclient.arrays import Float32
 from potclient.errors import BadReplyError, UsageError
 from potclient.kernels import KernelSet
-from potclient.results import Float32
 from potschemas import messages
 from potschemas.messages import DType
 from potschemas.wire import WireError, decode, decode_array, encode, encode_array

@@ -22,13 +22,14 @@ from potclient.feed import FeedOptions
 from potclient.kernels import KernelSet
 from potclient.link import Link, MessageT, Subscription
 from potclient.mirror import MapMirror
+from potclient.occupancy import Grid, Occupancy
 from potclient.questions import atoms, control, grid, info, params, rays, risk, tiles
 from potclient.questions.grid import ProgressCallback
 from potclient.questions.points import PointsQuestion
 from potclient.questions.rays import Rays
 from potclient.questions.risk import Risk
 from potclient.questions.tiles import MIRROR_MARGIN_M
-from potclient.results import FeedCounts, Grid, Occupancy, Receipt, TransportedParams
+from potclient.results import FeedCounts, Receipt, TransportedParams
 from potclient.session import SessionOptions
 from potschemas import messages
 from potschemas.keys import DEFAULT_ROOT, MapKeys, stats_key
@@ -145,7 +146,7 @@ class MapClient:
         return self._link.wait_ready(timeout_s)
 
     def wait_for_match(self, op: str, timeout_s: float | None = None) -> None:
-        """Wait until somebody answers questions of a kind, warm or not: one of `keys.QUERY_OPS`.
+        """Wait until somebody answers questions of a kind, warm or not: `points`, `grid`, ...
 
         Raises:
             NoServerError: nobody does within `timeout_s` (default: the client's).

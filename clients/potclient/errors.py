@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
+from potschemas import messages
 from potschemas.messages import ABSENT, ErrorCode, ErrorReply
-
-if TYPE_CHECKING:
-    from potclient.results import Receipt
 
 
 class PotclientError(Exception):
@@ -68,7 +64,7 @@ class MapServerError(PotclientError):
 
     code: str = "internal"
     reason: str | None = None  # finer than the code, where it has several causes
-    receipt: Receipt | None = None  # set where the refusal was a receipt of `MapClient.integrate`
+    receipt: messages.Receipt | None = None  # set where the refusal was a receipt of `MapClient.integrate`
 
     def __init__(
         self, message: str, *, retryable: bool | None = None, retry_after_s: float | None = None

@@ -13,11 +13,12 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from potclient.arrays import Float64
 from potclient.errors import UsageError
 from potclient.files import whole
 from potclient.kernels import KernelSet
+from potclient.occupancy import Grid
 from potclient.octomap import KEY_ORIGIN, OcTreeBuilder, write_bt
-from potclient.results import Float64, Grid
 from potschemas import messages
 
 Int64 = NDArray[np.int64]

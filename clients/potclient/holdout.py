@@ -6,9 +6,9 @@ import dataclasses
 
 import numpy as np
 
+from potclient.arrays import Bool, Float64
 from potclient.datasets.scans import RecordedScan
 from potclient.errors import UsageError
-from potclient.results import Bool, Float64
 
 FREE_GAP_M = 0.5
 

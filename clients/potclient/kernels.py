@@ -12,9 +12,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from potclient.arrays import Bool, Float32, Float64, as_points
 from potclient.errors import BadReplyError, UsageError
 from potclient.files import save_npz
-from potclient.results import Bool, Float32, Float64, Occupancy, as_points
+from potclient.occupancy import Occupancy
 from potschemas import answers
 from potschemas.answers import RULE_FIELDS, AnswerRule, LatentGradients, LatentSums
 from potschemas.messages import Array, DType, Kernels

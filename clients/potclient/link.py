@@ -211,7 +211,7 @@ class Link:
     # --- questions -----------------------------------------------------------------------------------------------------------
 
     def ask(self, op: str, request: Message, kind: type[MessageT], timeout_s: float | None) -> MessageT:
-        """The only reply to a question of the map, one of `keys.QUERY_OPS`.
+        """The only reply to a question of the map: `points`, `grid`, ...
 
         Args:
             op: Which question.

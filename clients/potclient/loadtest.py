@@ -12,11 +12,12 @@ from typing import Any, NamedTuple
 import msgspec
 import numpy as np
 
+from potclient.arrays import Float64
 from potclient.client import MapClient
 from potclient.datasets.scans import RecordedScan, Recording
 from potclient.errors import OverloadedError, PotclientError, UsageError
 from potclient.feed import FeedOptions
-from potclient.results import FeedCounts, Float64, Receipt
+from potclient.results import FeedCounts, Receipt
 from potclient.session import SessionOptions
 from potschemas.keys import DEFAULT_ROOT
 

@@ -7,8 +7,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from potclient.arrays import Float64
 from potclient.errors import UsageError
-from potclient.results import Float64
 
 N_BINS = 15
 CLIP = 1e-6

@@ -12,10 +12,11 @@ import msgspec
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from potclient.arrays import Bool, Float32, Float64
 from potclient.errors import BadReplyError, UsageError
 from potclient.kernels import KernelSet
+from potclient.occupancy import Occupancy
 from potclient.parts import PartCheck
-from potclient.results import Bool, Float32, Float64, Occupancy
 from potschemas.answers import RULE_FIELDS, AnswerRule
 from potschemas.messages import MAX_PART_KERNELS, CodedKernels, DType, Packed, TilesPart, TilesQuery
 from potschemas.wire import WireError, pack_array, unpack_array

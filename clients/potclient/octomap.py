@@ -15,9 +15,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from potclient.arrays import Bool
 from potclient.errors import UsageError
 from potclient.files import whole
-from potclient.results import Bool
 
 Int64 = NDArray[np.int64]
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from potclient.errors import UsageError
-from potclient.results import Grid
+from potclient.occupancy import Grid
 
 _UNKNOWN = "#e4e4e4"
 _ECHOES: dict[str, Any] = {"color": "black", "markersize": 0.8, "alpha": 0.5}

@@ -187,7 +187,7 @@ class _Book:
                 status = "dropped" if error.retryable else "rejected"
                 self._book(_unsettled(index, scan, status, reason=error.code, message=str(error)))
                 return
-            receipt = error.receipt
+            receipt = Receipt(error.receipt)
         self._book(_outcome(index, scan, receipt))
 
     def on_receipt(self, receipt: Receipt) -> None:

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from potclient import results
 from potclient.kernels import KernelSet as ClientKernels
+from potclient.occupancy import Grid
 from potschemas import messages
 from potserver.adapters.questions.info import encode_limits, snapshot_fields
 from potserver.asking.grid import GridPlan
@@ -61,7 +61,7 @@ class UnservedMap:
                 ClientKernels.from_message(message, map_revision=self._map.map_revision),
             )
 
-    def grid(self, lower: ArrayLike, upper: ArrayLike, resolution: float) -> results.Grid:
+    def grid(self, lower: ArrayLike, upper: ArrayLike, resolution: float) -> Grid:
         """Occupancy at the cell centres of a box, m, map frame."""
         low, high = np.asarray(lower, np.float64), np.asarray(upper, np.float64)
         nx, ny, nz = (int(n) for n in np.ceil((high - low) / resolution - 1e-6))
@@ -71,7 +71,7 @@ class UnservedMap:
         def cells(array: NDArray[Any]) -> NDArray[np.float32]:
             return array.astype(np.float32).reshape(nx, ny, nz)
 
-        return results.Grid(
+        return Grid(
             lower=low,
             resolution=resolution,
             mean=cells(o.mean),

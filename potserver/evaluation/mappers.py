@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from potclient.arrays import Bool, Float64
 from potclient.datasets import RecordedScan
-from potclient.results import Bool, Float64
 from potserver.domain.kernel_map import KernelMap
 from potserver.domain.types import KernelSet
 from potserver.mapping.service import MappingService

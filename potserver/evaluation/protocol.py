@@ -9,10 +9,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from potclient.arrays import Bool, Float64
 from potclient.datasets import RecordedScan, Recording
 from potclient.holdout import HoldOut, LabelledPoints
 from potclient.metrics import Metrics, score
-from potclient.results import Bool, Float64
 from potclient.towns import Town, TownRecording
 from potserver.domain.kernel_map import KernelMap
 from potserver.domain.types import Unknown

@@ -11,7 +11,6 @@ import re
 from typing import NamedTuple
 
 DEFAULT_ROOT = "pot/v1"
-QUERY_OPS = ("integrate", "points", "grid", "rays", "risk", "params", "tiles", "atoms", "info")
 CONTROL_VERBS = ("save", "load", "clear", "drain", "merge", "forget")
 RESERVED_MAP_IDS = ("srv",)  # `<root>/srv/...` belongs to the servers
 _ID = re.compile(r"[a-z0-9][a-z0-9_.-]{0,62}\Z")
@@ -79,7 +78,7 @@ class MapKeys(NamedTuple):
         return f"{self.root}/{self.map_id}/ev/revision"
 
     def query(self, op: str) -> str:
-        """QUERY: one of `QUERY_OPS`."""
+        """QUERY: `integrate`, or a question."""
         return f"{self.root}/{self.map_id}/q/{op}"
 
     def control(self, verb: str) -> str:

@@ -16,7 +16,6 @@ from potschemas import keys, messages, wire
 from potschemas.answers import AnswerRule
 from potschemas.messages import AtomsAction
 from potserver import errors
-from potserver.adapters.queryable import INTEGRATE
 from potserver.adapters.questions import registry
 from potserver.adapters.questions.atoms import action_of
 from potserver.adapters.questions.control import VERBS, work_of
@@ -77,7 +76,11 @@ def outcome(read: Callable[[], Any]) -> str:
 
 
 def test_every_operation_and_every_verb_of_the_contract_is_served_once() -> None:
-    assert [INTEGRATE, *(question.op for question in QUESTIONS)] == list(keys.QUERY_OPS)
+    asked = {kind for kind in messages.ALL_MESSAGES if kind.__name__.endswith("Query")} - {
+        messages.StatsQuery
+    }
+    assert {question.query for question in QUESTIONS} == asked
+    assert {f"pot.{question.op}_query.v1" for question in QUESTIONS} == {kind.schema for kind in asked}
     assert set(VERBS) == set(keys.CONTROL_VERBS)
 
 

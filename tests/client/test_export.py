@@ -16,8 +16,8 @@ from potclient import export
 from potclient.errors import InternalError, UsageError
 from potclient.export import CellBox, export_bt, export_npz, export_pgm, export_ply
 from potclient.kernels import KernelSet
+from potclient.occupancy import Grid
 from potclient.octomap import DEPTH, KEY_ORIGIN, read_bt
-from potclient.results import Grid
 from potschemas import messages
 from potschemas.answers import AnswerRule
 from potschemas.examples import examples

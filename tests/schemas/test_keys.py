@@ -7,7 +7,6 @@ import pytest
 from potschemas.keys import (
     CONTROL_VERBS,
     DEFAULT_ROOT,
-    QUERY_OPS,
     MapKeys,
     check_id,
     check_map_id,
@@ -32,8 +31,7 @@ def test_keys_are_the_contract() -> None:
     assert stats_key(DEFAULT_ROOT, "s1") == "pot/v1/srv/s1/stats"
 
 
-def test_operations_are_the_contract() -> None:
-    assert QUERY_OPS == ("integrate", "points", "grid", "rays", "risk", "params", "tiles", "atoms", "info")
+def test_verbs_are_the_contract() -> None:
     assert CONTROL_VERBS == ("save", "load", "clear", "drain", "merge", "forget")
 
 

@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 
-from potclient.results import Float64
+from potclient.arrays import Float64
 
 
 def add_pose_flag(parser: argparse.ArgumentParser) -> None:

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from potclient.arrays import Float64
 from potclient.commands.shared import (
     EXIT_OK,
     add_command,
@@ -21,7 +22,6 @@ from potclient.commands.shared import (
 )
 from potclient.errors import UsageError
 from potclient.files import save_npz
-from potclient.results import Float64
 
 _SHOWN = 20  # answers in the table
 

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from potclient.arrays import Float64
 from potclient.commands.shared import (
     EXIT_OK,
     add_command,
@@ -24,7 +25,6 @@ from potclient.commands.shared import (
 from potclient.errors import UsageError
 from potclient.files import save_npz
 from potclient.questions.rays import Rays
-from potclient.results import Float64
 
 _ARRAYS = ("hit_probability", "mean_m", "std_m", "quantile_m", "unknown_range_m", "unknown_share")
 _SHOWN = 40  # answers in the table

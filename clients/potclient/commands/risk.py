@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from potclient.arrays import Float64
 from potclient.commands.shared import (
     EXIT_OK,
     add_command,
@@ -20,7 +21,6 @@ from potclient.commands.shared import (
     say_rows,
     write_json,
 )
-from potclient.results import Float64
 
 _ARRAYS = ("max_probability", "union_probability", "unknown_share")
 _TOTALS = (

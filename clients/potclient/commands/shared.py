@@ -14,11 +14,11 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from potclient.arrays import Float64
 from potclient.client import MapClient
 from potclient.datasets import FORMATS, FRAMES, Recording, open_dataset
 from potclient.errors import UsageError
 from potclient.feed import FeedOptions
-from potclient.results import Float64
 from potclient.session import add_zenoh_arguments, options_from_arguments
 from potschemas import messages
 from potschemas.keys import DEFAULT_ROOT

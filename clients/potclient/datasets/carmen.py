@@ -10,9 +10,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from potclient.arrays import Float64
 from potclient.datasets.scans import RecordedScan, Recording, growing, read_table
 from potclient.errors import DatasetError
-from potclient.results import Float64
 
 DEFAULT_NO_RETURN_M = 50.0
 DEFAULT_MAX_RANGE_M = 30.0

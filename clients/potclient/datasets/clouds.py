@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from potclient.arrays import Bool, Float32, Float64
 from potclient.datasets.scans import RecordedScan, Recording, natural_key, read_poses, read_stamps
 from potclient.errors import DatasetError
-from potclient.results import Bool, Float32, Float64
 
 RECORDING_FILE = "recording.json"
 FRAMES = ("auto", "sensor", "world")

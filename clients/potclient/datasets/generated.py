@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
+from potclient.arrays import Bool, Float64, as_points
 from potclient.datasets.scans import RecordedScan, Recording
-from potclient.results import Bool, Float64, as_points
 
 _GROUND_Z_M = 0.0
 _WALL_M = 0.5

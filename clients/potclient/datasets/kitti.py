@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
+from potclient.arrays import Float64
 from potclient.datasets.scans import RecordedScan, Recording, natural_key, read_poses, read_stamps
 from potclient.errors import DatasetError
-from potclient.results import Float64
 
 
 class KittiRecording(Recording):

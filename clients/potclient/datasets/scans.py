@@ -11,8 +11,8 @@ from typing import overload
 
 import numpy as np
 
+from potclient.arrays import Bool, Float32, Float64
 from potclient.errors import DatasetError
-from potclient.results import Bool, Float32, Float64
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False, kw_only=True)

@@ -12,8 +12,8 @@ from numpy.typing import ArrayLike, NDArray
 from potclient.arguments import corner
 from potclient.errors import BadReplyError, IncompleteReplyError, UsageError
 from potclient.link import Link
+from potclient.occupancy import Grid, Occupancy
 from potclient.parts import PartCheck
-from potclient.results import Grid, Occupancy
 from potschemas import messages
 
 ProgressCallback = Callable[[int, int], None]  # (parts received, parts in all)

@@ -10,10 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from potclient.arrays import as_points
 from potclient.errors import OverloadedError
 from potclient.link import Link
+from potclient.occupancy import Occupancy
 from potclient.questions import info
-from potclient.results import Occupancy, as_points
 from potschemas import messages
 from potschemas.wire import encode_array
 

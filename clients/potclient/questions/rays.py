@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from potclient.arguments import positive, positive_or_none, unknown_kind
+from potclient.arrays import Float32, arrays_of, as_points
 from potclient.errors import TooLargeError, UsageError
 from potclient.link import Link
-from potclient.results import Float32, arrays_of, as_points
 from potschemas import messages
 from potschemas.wire import encode_array
 

@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from potclient.arguments import numbers, positive_or_none, unknown_kind
+from potclient.arrays import Float32, arrays_of
 from potclient.errors import UsageError
 from potclient.link import Link
-from potclient.results import Float32, arrays_of
 from potschemas import messages
 from potschemas.wire import encode_array
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from potclient.results import Float64
+from potclient.arrays import Float64
 from potclient.towns.site import Frame, Site
 from potclient.towns.solids import Kind, Part, blob, box, post
 from potclient.towns.things import (

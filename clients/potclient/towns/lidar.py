@@ -7,8 +7,8 @@ import math
 
 import numpy as np
 
+from potclient.arrays import Float64
 from potclient.errors import DatasetError
-from potclient.results import Float64
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)

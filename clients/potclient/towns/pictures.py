@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from potclient.arrays import Float64
 from potclient.errors import UsageError
-from potclient.results import Float64
 from potclient.towns.raycast import RayScene
 from potclient.towns.recording import PERIOD_S, TownRecording, open_town
 from potclient.towns.solids import Kind, SolidSet

@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from potclient.arrays import Float32, Float64
 from potclient.errors import DatasetError
-from potclient.results import Float32, Float64
 from potclient.towns.solids import Int64, SolidSet, triangles_of
 
 HOW_TO_INSTALL = "towns are ray cast by open3d: pip install 'potclient[towns]'"

@@ -9,9 +9,9 @@ from typing import overload
 
 import numpy as np
 
+from potclient.arrays import Float64
 from potclient.datasets.scans import RecordedScan, Recording
 from potclient.errors import DatasetError
-from potclient.results import Float64
 from potclient.towns.lidar import SENSORS, Lidar
 from potclient.towns.raycast import RayScene, require
 from potclient.towns.solids import SolidSet

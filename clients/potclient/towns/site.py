@@ -9,7 +9,7 @@ from functools import cached_property
 
 import numpy as np
 
-from potclient.results import Float64
+from potclient.arrays import Float64
 from potclient.towns.solids import Kind, Part, placed, slab
 from potclient.towns.streets import Crossing, StreetGrid, stream
 from potclient.towns.styles import Style

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from potclient.results import Bool, Float64
+from potclient.arrays import Bool, Float64
 
 Int64 = NDArray[np.int64]
 

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from potclient.results import Float64
+from potclient.arrays import Float64
 from potclient.towns.styles import Style
 
 Int64 = NDArray[np.int64]

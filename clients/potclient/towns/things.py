@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from potclient.results import Float64
+from potclient.arrays import Float64
 from potclient.towns.solids import BOX, OCTAGON, PRISM, Kind, Part, blob, box, post
 
 # Cabin of each model: where it begins and ends at the belt line, and at the top, in shares of half the length.

@@ -7,8 +7,8 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike
 
+from potclient.arrays import Bool, Float64, as_points
 from potclient.errors import DatasetError
-from potclient.results import Bool, Float64, as_points
 from potclient.towns.blocks import build_block
 from potclient.towns.site import EAST, NORTH, SOUTH, WEST, Block, Door, Name, Parked
 from potclient.towns.solids import Int64, Part, SolidSet

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from potclient.results import Bool, Float64
+from potclient.arrays import Bool, Float64
 from potclient.towns.site import Name, Parked
 from potclient.towns.solids import Part, placed
 from potclient.towns.streets import Drive, StreetGrid, stream

@@ -8,8 +8,8 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from potclient.arrays import Bool, Float64
 from potclient.datasets import RecordedScan
-from potclient.results import Bool, Float64
 from potserver.evaluation.mappers import Mapper, Size
 from potserver.numerics.voxel_hash import empty_table, find, pack
 

@@ -6,8 +6,8 @@ import math
 
 import numpy as np
 
+from potclient.arrays import Bool, Float64
 from potclient.datasets import RecordedScan
-from potclient.results import Bool, Float64
 from potschemas.answers import AnswerRule
 from potserver.domain.kernel_map import KernelMap
 from potserver.domain.types import KernelSet

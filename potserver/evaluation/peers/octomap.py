@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from potclient.arrays import Bool, Float64
 from potclient.datasets import RecordedScan
-from potclient.results import Bool, Float64
 from potserver.errors import SettingsError
 from potserver.evaluation.mappers import Mapper, Size
 from potserver.numerics.geometry import voxel_pick
