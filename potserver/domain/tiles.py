@@ -99,7 +99,7 @@ class Tile(NamedTuple):
     @property
     def is_empty(self) -> bool:
         """Nothing was ever seen here, or it is forgotten."""
-        return len(self.rows.occupied) == 0 and len(self.kernels) == 0
+        return len(self.rows.kind) == 0 and len(self.kernels) == 0
 
 
 class TileGrid(NamedTuple):
@@ -233,7 +233,7 @@ class Region:
         shift = np.reshape(found, (-1, 3)).astype(np.int64) - low
         rows = Rows.concatenate([decay(tile.rows, age(tile)) if age else tile.rows for tile in members])
         kernels = MapKernels.concatenate([tile.kernels for tile in members])
-        of_row = np.repeat(shift, [len(tile.rows.occupied) for tile in members], axis=0)
+        of_row = np.repeat(shift, [len(tile.rows.kind) for tile in members], axis=0)
         of_kernel = np.repeat(shift, [len(tile.kernels) for tile in members], axis=0)
         edge = _tile_edge(rows, grid)
         return Region(
@@ -278,7 +278,7 @@ class Region:
 
 def _tile_edge(rows: Rows, grid: TileGrid) -> NDArray[np.int64]:
     """(R, 1) voxels along a tile's edge, for each row in its own kind of voxel."""
-    return np.where(rows.occupied, 2 * grid.voxels, grid.voxels)[:, None]
+    return np.where(rows.is_half, 2 * grid.voxels, grid.voxels)[:, None]
 
 
 def _by_number(number: NDArray[np.intp], n: int) -> list[NDArray[np.intp]]:

@@ -30,7 +30,7 @@ class DefaultPipeline(Pipeline):
         with clock("label"):
             seen = self.label(scan, draws)
         tiled, source = self.ground(state, seen).with_robot(scan.robot_id)
-        look = Look(seen.labelled, seen.beams.learned, scan.origin, source, scan.is_planar)
+        look = Look(seen.labelled, seen.beams.learned, scan.origin, source, scan.is_planar, draws.surface)
         own, fused = self.learn(tiled, look, seen, moment, carrier, clock)
         with clock("index"):
             tiled, fused = self.age(tiled.with_tiles(fused.tiles, threads=self.threads), fused, moment)

@@ -13,11 +13,11 @@ from potserver.mapping.fusion import (
     FitEffort,
     FusionOptions,
     Moment,
-    Samples,
     add_evidence,
     add_kernels,
     refit,
 )
+from potserver.mapping.surfaces import Samples
 from potserver.numerics import evidence
 from potserver.numerics.geometry import rotated_diagonal
 
@@ -95,7 +95,7 @@ def merge(
                     region,
                     Samples(
                         points[data.source == source] - region.origin_m,
-                        data.occupied[data.source == source],
+                        data.kind[data.source == source],
                         data.sums[data.source == source, 3],
                     ),
                     number,
@@ -132,7 +132,7 @@ def remove_robot(
         for index, tile in tiled.tiles.items()
         if (tile.rows.source == source).any()
     }
-    if not without and tiled.tiles and not any(len(tile.rows.occupied) for tile in tiled.tiles.values()):
+    if not without and tiled.tiles and not any(len(tile.rows.kind) for tile in tiled.tiles.values()):
         raise UnsupportedError("the map keeps no evidence, only kernels: nobody's share of it can be told")
     # kernels reach beyond their tile: those beside it lose data too
     around = {

@@ -30,15 +30,18 @@ from potserver.errors import SolverError
 from potserver.mapping.placing import activation, gamma_of_spacing, kernels_at
 from potserver.mapping.refinement import FEATURE_CUT
 from potserver.mapping.settings import MappingSettings
+from potserver.mapping.surfaces import Samples, surface_samples
 from potserver.numerics import evidence
+from potserver.numerics.arrays import UInt8
 from potserver.numerics.beams import Beams, LabelledPoints, beam_weights
-from potserver.numerics.feature_blocks import feature_blocks, gradient_and_diagonal
+from potserver.numerics.feature_blocks import Blocks, feature_blocks, gradient_and_diagonal
 from potserver.numerics.geometry import bounds, inside_box
 from potserver.numerics.lattice_nodes import new_nodes
 from potserver.numerics.warm_fit import Prior, Solver, warm_fit
 
 _FINEST_M, _COARSEST_M, _FINE_PER_RANGE = 0.2, 0.4, 1.0 / 20.0
-_COARSE_REACH = 1.0  # spacings: nearer coarse nodes than this get a kernel, see lattice_nodes.new_nodes
+_COARSE_REACH = 0.7  # spacings: nearer coarse nodes than this get a kernel, see lattice_nodes.new_nodes
+_FINE_REACH = 0.9  # the same for fine nodes about hits: faces have nodes on both sides
 _TOO_WIDE = 1.5  # coarse spacings
 _REACHED = 0.1  # activation by a carried kernel below which a point or a row is not its own
 _EXPLAINED = 1.0  # activation by carried kernels at which the lattice adds none
@@ -46,6 +49,8 @@ _LONGEST_STEP = 4.0  # Newton steps
 _UNSUPPORTED = 1e-5  # of a kernel's curvature: what no row within its reach leaves
 _STALE = 0.125  # half-lives after which a tile that no scan touches is fitted again
 _MEMORY = 200.0  # looks that one place remembers; older ones give way
+_SUPPORT_OF_NOTHING = 0.05  # of a kernel; with so much support its variance is half the prior's
+_WORTH_OF_HALF = 0.25  # of a row in a voxel of half the resolution, which has an eighth of the volume
 _SATURATION = 20.0  # looks at one place that count in a solve; further ones repeat them
 _CHEAP_VALUES = 60_000_000  # features that a solve may touch for more Newton steps than it must take
 
@@ -53,7 +58,7 @@ _CHEAP_VALUES = 60_000_000  # features that a solve may touch for more Newton st
 class FitEffort(NamedTuple):
     """Steps of one solve, from where the map is."""
 
-    newton_steps: int = 2  # at least
+    newton_steps: int = 3  # at least
     most_newton_steps: int = 6  # where the map is small and steps are cheap
     gradient_steps: int = 4  # conjugate-gradient steps for each Newton step
 
@@ -89,6 +94,7 @@ class Look(NamedTuple):
     origin: Float64  # (3,) m, map frame
     source: int  # the robot's number in the map
     is_planar: bool  # kernels stay in the plane of the points
+    rng: np.random.Generator  # of the samples next to faces
 
 
 class Moment(NamedTuple):
@@ -173,30 +179,24 @@ def fuse(
     )  # fmt: skip
 
 
-class Samples(NamedTuple):
-    """Labelled points with weights, in a region's frame."""
-
-    points: Float64  # (N, 3) m
-    occupied: Bool  # (N,)
-    weight: Float64 | Float32  # (N,) looks
-
-
 def _samples_of(look: Look, region: Region, options: FusionOptions, threads: int) -> Samples:
-    """A scan's points, and free ones where its beams see through what stood; the rows of that are weakened in place."""
-    points = look.labelled.points - region.origin_m
-    occupied, weight = look.labelled.occupied, beam_weights(look.labelled)
-    if not options.fade_rate:
-        return Samples(points, occupied, weight)
-    start = look.origin - region.origin_m
-    seen = evidence.see_through(
-        region.rows, look.beams, start, fine_m=region.grid.fine_m, rate=options.fade_rate, gap_m=options.free_gap_m,
-        threads=threads,
-    )  # fmt: skip
-    return Samples(
-        np.concatenate([points, seen.points]),
-        np.concatenate([occupied, np.zeros(len(seen.points), bool)]),
-        np.concatenate([weight, seen.weight]),
-    )
+    """All that a scan says, and free samples where its beams see through what stood; the rows of that are weakened in place."""
+    grid, start = region.grid, look.origin - region.origin_m
+    labelled = look.labelled
+    parts = [
+        Samples(labelled.points - region.origin_m, labelled.occupied.astype(np.uint8), beam_weights(labelled))
+    ]
+    if options.fade_rate:
+        seen = evidence.see_through(
+            region.rows, look.beams, start, fine_m=grid.fine_m, rate=options.fade_rate, gap_m=options.free_gap_m,
+            threads=threads,
+        )  # fmt: skip
+        parts.append(Samples(seen.points, np.full(len(seen.points), evidence.FREE, np.uint8), seen.weight))
+    known = region.rows.take(region.rows.occupied & evidence.is_alive(region.rows))
+    where = evidence.positions(known, grid.fine_m)
+    voxel_m = 0.5 * grid.fine_m
+    parts.append(surface_samples(look.beams, start, where, voxel_m, look.rng, planar=look.is_planar))
+    return Samples.concatenate(parts)
 
 
 def append(tiled: TiledMap, carried: KernelSet, moment: Moment) -> dict[TileIndex, Tile]:
@@ -261,16 +261,24 @@ def add_evidence(
     within: tuple[Float64, Float64] | None = None,
     turn: int = 0,
 ) -> evidence.Rows:
-    """Put samples into a region's rows; the rows that are new.
+    """Put samples into a region's rows; the rows of hits and free samples that are new.
 
     Within a box, old rows that say little join others: see `evidence.add_sparing`.
     """
+    fine_m = region.grid.fine_m
+    beside = (samples.kind == evidence.NEAR) | (samples.kind == evidence.SHADOW)
+    points, kind, weight = (column[~beside] for column in samples)
     rows, gained, n_old = evidence.add_sparing(
-        region.rows, *samples, region.grid.fine_m, source, within=within, turn=turn
+        region.rows, points, kind, weight, fine_m, source, within=within, turn=turn
     )
-    evidence.forget(rows.sums, gained, evidence.cells(rows), _MEMORY)
+    new = slice(n_old, len(rows.kind))
+    points, kind, weight = (column[beside] for column in samples)
+    rows, more = evidence.add(rows, points, kind, weight, fine_m, source)
+    more[: len(gained)] += gained
+    evidence.clip_shadows(rows)
+    evidence.forget(rows.sums, more, evidence.cells(rows), _MEMORY)
     region.rows = rows
-    return rows.take(slice(n_old, None))
+    return rows.take(new)
 
 
 def add_kernels(
@@ -286,7 +294,7 @@ def add_kernels(
     asking = evidence.positions(new_rows, grid.fine_m)
     parts = [taken]
     from_atoms = KernelSet.concatenate([present.kernels.take(present.level == CARRIED), taken.kernels])
-    for level, spacing, within in ((COARSE, grid.coarse_m, _COARSE_REACH), (FINE, grid.fine_m, 0.0)):
+    for level, spacing, within in ((COARSE, grid.coarse_m, _COARSE_REACH), (FINE, grid.fine_m, _FINE_REACH)):
         there = present.kernels.hinge_mean[present.level == level]
         nodes = new_nodes(
             asking if level == COARSE else asking[new_rows.occupied],
@@ -356,6 +364,36 @@ def _fits_budget(present: Float64, added: Float64, grid: TileGrid, limit: int) -
     return place[len(present) :] < limit
 
 
+class _Support(NamedTuple):
+    """How much evidence stands behind each of K kernels."""
+
+    seen: Float32  # (K,) sum over seen rows of their worth times phi^2
+    unseen: Float32  # (K,) the same over shadows
+
+    def variance(self, prior_var: Float32) -> Float32:
+        """(K,) log-odds^2: the prior's where nothing was seen, and the less the more was.
+
+        The curvature of the loss would do for a wide posterior. Here labels part cleanly: sure rows have no curvature, and
+        those of one look would leave a kernel as uncertain as those of none.
+        """
+        unseen = self.unseen + np.float32(_SUPPORT_OF_NOTHING)
+        return prior_var * unseen / (unseen + self.seen)
+
+
+def _support_of(blocks: Blocks, kind: UInt8, counts: Float32, threads: int) -> _Support:
+    """The support of a block's kernels by rows of these kinds and counts."""
+    is_shadow = kind == evidence.SHADOW
+    worth = np.minimum(counts, np.float32(1.0)) * np.where(
+        kind & 1, np.float32(_WORTH_OF_HALF), np.float32(1.0)
+    )
+    zero = np.zeros(len(kind), np.float32)
+    seen, unseen = (
+        gradient_and_diagonal(blocks, zero, weight[blocks.order].astype(np.float32), threads=threads)[1]
+        for weight in (np.where(is_shadow, 0.0, worth), is_shadow & (counts > 0))
+    )
+    return _Support(seen, unseen)
+
+
 def _fit(region: Region, lower: Float64, upper: Float64, effort: FitEffort, threads: int) -> bool:
     """Solve the weights of the kernels in a box, those around it held; whether the solve went well.
 
@@ -370,7 +408,7 @@ def _fit(region: Region, lower: Float64, upper: Float64, effort: FitEffort, thre
     local = np.flatnonzero(inside_box(kernels.hinge_mean, lower - 4 * pad, upper + 4 * pad))
     hinge = kernels.hinge_mean[local]
     free = inside_box(hinge, lower, upper)
-    counts = evidence.counts(region.rows.sums, evidence.cells(region.rows), _SATURATION)
+    counts = evidence.counts(region.rows, evidence.cells(region.rows), _SATURATION)[rows]
     blocks = feature_blocks(
         where[rows],
         hinge,
@@ -384,7 +422,7 @@ def _fit(region: Region, lower: Float64, upper: Float64, effort: FitEffort, thre
     cheap = _CHEAP_VALUES // max(per_step, 1)
     n_newton = int(np.clip(cheap, effort.newton_steps, effort.most_newton_steps))
     fit = warm_fit(
-        blocks, region.rows.occupied[rows], counts[rows],
+        blocks, evidence.LABELS[region.rows.kind[rows]], counts,
         Prior(region.kernels.prior_mean[local], region.kernels.prior_var[local]), kernels.weight_mean[local],
         Solver(n_newton, effort.gradient_steps, _LONGEST_STEP), free=free, threads=threads,
     )  # fmt: skip
@@ -392,7 +430,8 @@ def _fit(region: Region, lower: Float64, upper: Float64, effort: FitEffort, thre
         raise SolverError(f"the weights of {len(local)} kernels on {len(rows)} rows came out NaN or infinite")
     mean, var = kernels.weight_mean.copy(), kernels.weight_var.copy()
     solved = local[free]
-    mean[solved], var[solved] = fit.weights[free], fit.var[free]
+    support = _support_of(blocks, region.rows.kind[rows], counts, threads)
+    mean[solved], var[solved] = fit.weights[free], support.variance(region.kernels.prior_var[local])[free]
     keep = np.ones(len(kernels), bool)
     keep[local[free & (fit.support < _UNSUPPORTED)]] = False
     region.kernels = MapKernels(

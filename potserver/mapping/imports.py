@@ -9,8 +9,9 @@ from potserver.domain.map_state import MapState
 from potserver.domain.tiles import Region, TiledMap, TileGrid
 from potserver.domain.types import Bool, Float32, Float64, KernelSet
 from potserver.errors import BadPointsError, EmptyError
-from potserver.mapping.fusion import Moment, Samples, add_evidence, append
+from potserver.mapping.fusion import Moment, add_evidence, append
 from potserver.mapping.service import MappingService
+from potserver.mapping.surfaces import Samples
 
 
 def state_of_places(
@@ -41,7 +42,9 @@ def state_of_places(
     for members in np.split(order, cuts):
         centre = (tile[members[0]] + 0.5) * grid.size_m
         region = Region.of(tiled, centre, centre)
-        samples = Samples(points[members] - region.origin_m, occupied[members], weight[members])
+        samples = Samples(
+            points[members] - region.origin_m, occupied[members].astype(np.uint8), weight[members]
+        )
         add_evidence(region, samples, number)
         tiled = tiled._replace(
             tiles={**tiled.tiles, **region.tiles(centre, centre)}

@@ -31,15 +31,18 @@ class BeamLimits(NamedTuple):
 
 
 class Draws(NamedTuple):
-    """The random choices of one scan. What is checked has a generator of its own: checking changes nothing else."""
+    """The random choices of one scan. Each use has a generator of its own, so that none changes another."""
 
     learn: np.random.Generator
     check: np.random.Generator
+    surface: np.random.Generator
 
     @staticmethod
     def of(seed: int, n_scans: int) -> Draws:
         """Those of the scan that comes after `n_scans` others."""
-        return Draws(np.random.default_rng((seed, n_scans)), np.random.default_rng((seed, n_scans, 1)))
+        return Draws(
+            *(np.random.default_rng(key) for key in ((seed, n_scans), (seed, n_scans, 1), (seed, n_scans, 2)))
+        )
 
 
 class DrawnBeams(NamedTuple):

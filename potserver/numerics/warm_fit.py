@@ -60,7 +60,7 @@ class WarmFit(NamedTuple):
 
 def warm_fit(
     blocks: Blocks,
-    labels: Bool,
+    labels: Bool | Float32,
     counts: Float32,
     prior: Prior,
     start: Float32,
@@ -73,7 +73,8 @@ def warm_fit(
 
     Args:
         blocks: Phi.
-        labels: (N,) true = occupied, in the order of the points that the blocks were built from.
+        labels: (N,) in [0, 1], or true = occupied, in the order of the points that the blocks were built from. One half says
+            that nothing is known.
         counts: (N,) how much each row counts, >= 0, same order.
         prior: Of the weights.
         start: (K,) log-odds: the weights as they are.
@@ -82,7 +83,8 @@ def warm_fit(
         threads: Threads for the products with the features.
     """
     solver = solver or Solver()
-    y, c = labels[blocks.order], np.ascontiguousarray(counts[blocks.order], np.float32)
+    y = np.asarray(labels, np.float32)[blocks.order]
+    c = np.ascontiguousarray(counts[blocks.order], np.float32)
     precision = (1.0 / prior.var).astype(np.float32)
     mask = np.ones(len(start), np.float32) if free is None else free.astype(np.float32)
     w = start.astype(np.float32)
@@ -186,9 +188,10 @@ def _terms(f, y, c, least):
         x = f[i]
         e = np.exp(-abs(x))
         p = one / (one + e) if x >= 0 else e / (one + e)
-        residual[i] = c[i] * (p - one if y[i] else p)
+        residual[i] = c[i] * (p - y[i])
         q = p * (one - p)
-        if y[i] != (x > 0) and abs(x) > np.float32(0.01):
+        is_right = y[i] > half if x > 0 else y[i] < half
+        if not is_right and abs(x) > np.float32(0.01):
             q = (p - half) / x
         curvature[i] = c[i] * max(q, least)
     return residual, curvature
@@ -200,7 +203,5 @@ def _loss(f, change, size, y, c):
     total = 0.0
     for i in range(len(f)):
         x = f[i] + size * change[i]
-        if not y[i]:
-            x = -x
-        total += c[i] * (max(-x, np.float32(0)) + np.log1p(np.exp(-abs(x))))
+        total += c[i] * (max(x, np.float32(0)) - y[i] * x + np.log1p(np.exp(-abs(x))))
     return total

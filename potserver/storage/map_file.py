@@ -247,7 +247,7 @@ def describe(saved: SavedMap, path: Path) -> Contents:
     with contextlib.closing(connect_read_only(path, _KIND)) as connection, reading(path):
         n_bytes = int(connection.execute("SELECT COALESCE(SUM(LENGTH(data)), 0) FROM tiles").fetchone()[0])
     return Contents(
-        n_rows=sum(len(tile.rows.occupied) for tile in tiles),
+        n_rows=sum(len(tile.rows.kind) for tile in tiles),
         n_kernels=sum(len(tile.kernels) for tile in tiles),
         n_bytes=n_bytes,
     )

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from potserver.domain.tiles import CARRIED, MapKernels, Tile, TileGrid, TileIndex
 from potserver.domain.types import KernelSet
 from potserver.errors import MapFileError, ShapeError
-from potserver.numerics.evidence import Rows
+from potserver.numerics.evidence import LABELS, Rows
 from potserver.storage.seal import sealed, unsealed
 
 _HEAD = struct.Struct("<3i2q2I")  # index, revision, stamp_ns, rows, kernels
@@ -35,7 +35,7 @@ class _Column(NamedTuple):
 # Voxels are numbered within their tile, which has at most 2**14 along an edge.
 _ROWS = (
     _Column("voxel", "<i2", 3),
-    _Column("occupied", "|b1", 0),
+    _Column("kind", "|u1", 0),
     _Column("sums", "<f4", 4),
     _Column("source", "<i2", 0),
 )
@@ -58,7 +58,7 @@ def encode_tile(index: TileIndex, tile: Tile) -> bytes:
         *(_planes(getattr(kernels.kernels, c.name), c) for c in _KERNELS),
         *(_planes(getattr(kernels, c.name), c) for c in _MAP_KERNELS),
     ]
-    head = _HEAD.pack(*index, tile.revision, tile.stamp_ns, len(rows.occupied), len(kernels))
+    head = _HEAD.pack(*index, tile.revision, tile.stamp_ns, len(rows.kind), len(kernels))
     body = zlib.compress(b"".join(columns), _LEVEL)
     return sealed(head + body)
 
@@ -92,7 +92,7 @@ def decode_tile(data: bytes, grid: TileGrid, n_robots: int) -> tuple[TileIndex, 
         tile = Tile(
             Rows(
                 arrays["voxel"].astype(np.int32),
-                arrays["occupied"],
+                arrays["kind"],
                 arrays["sums"],
                 arrays["source"],
             ),
@@ -112,9 +112,10 @@ def decode_tile(data: bytes, grid: TileGrid, n_robots: int) -> tuple[TileIndex, 
 def _check(tile: Tile, grid: TileGrid, n_robots: int, index: TileIndex) -> None:
     """A sound checksum does not say who wrote the file."""
     rows, kernels = tile.rows, tile.kernels
-    edge = np.where(rows.occupied, 2 * grid.voxels, grid.voxels)[:, None]
+    edge = np.where(rows.is_half, 2 * grid.voxels, grid.voxels)[:, None]
     sound = (
         ((rows.voxel >= 0) & (rows.voxel < edge)).all()
+        and (rows.kind < len(LABELS)).all()
         and np.isfinite(rows.sums).all()
         and ((rows.source >= 0) & (rows.source < n_robots)).all()
         and ((kernels.level >= 0) & (kernels.level <= CARRIED)).all()

@@ -6,11 +6,17 @@
 from potserver.numerics.evidence.fading import SeenThrough, see_through
 from potserver.numerics.evidence.joining import TURNS, Joined, add_sparing
 from potserver.numerics.evidence.rows import (
+    FREE,
+    HIT,
+    LABELS,
+    NEAR,
+    SHADOW,
     Added,
     Cells,
     Rows,
     add,
     cells,
+    clip_shadows,
     counts,
     decay,
     forget,
@@ -20,6 +26,11 @@ from potserver.numerics.evidence.rows import (
 )
 
 __all__ = [
+    "FREE",
+    "HIT",
+    "LABELS",
+    "NEAR",
+    "SHADOW",
     "TURNS",
     "Added",
     "Cells",
@@ -29,6 +40,7 @@ __all__ = [
     "add",
     "add_sparing",
     "cells",
+    "clip_shadows",
     "counts",
     "decay",
     "forget",

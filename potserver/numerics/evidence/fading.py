@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from potserver.numerics.arrays import Bool, Float64, Int32, Int64
 from potserver.numerics.beams import Beams
-from potserver.numerics.evidence.rows import Rows, cells, is_alive, positions
+from potserver.numerics.evidence.rows import FREE, HIT, Rows, cells, is_alive, positions
 from potserver.numerics.geometry import bounds
 from potserver.numerics.threads import parallel_map, spans
 from potserver.numerics.voxel_hash import any_around, empty_table, find, pack
@@ -26,6 +26,9 @@ _SURE = 20.0  # the same, from which on hits fade in full
 _FREE_A_HIT = 2.0  # free weight that comes for each weight of hits, at a rate of 1
 _FREE_ALONE = 100.0  # the same, for each place
 _OUTVOTED = 3.0  # free weight in a cell, in weights of its hits, beyond which no more is added
+# what a look of each kind adds to the free weight that its cell may still take
+_ROOM = np.zeros(4)
+_ROOM[HIT], _ROOM[FREE] = _OUTVOTED, -1.0
 _WALK = 0.75  # step of a walk along a beam, in voxels of hits
 _BLOCK_SHIFT, _MAX_BLOCKS = 1, 2**22  # blocks of 2^shift voxels of hits along an edge
 _SPANS = 8  # of beams; the number of threads plays no part in how they are cut
@@ -174,7 +177,7 @@ def _fade(
     rows.sums[gone] *= np.exp(-rate * share)[:, None].astype(np.float32)
     # no cell's free weight may grow beyond its bound
     number, n_cells = cells(rows)
-    room = np.bincount(number, np.where(rows.occupied, _OUTVOTED, -1.0) * rows.sums[:, 3], n_cells)
+    room = np.bincount(number, _ROOM[rows.kind] * rows.sums[:, 3], n_cells)
     wanted = np.bincount(number[gone], weight, n_cells)
     weight *= np.minimum(1.0, np.maximum(room[number[gone]], 0.0) / wanted[number[gone]])
     return SeenThrough(positions(rows.take(gone), fine_m), weight)

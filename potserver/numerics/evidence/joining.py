@@ -7,8 +7,8 @@ from typing import NamedTuple
 import numba as nb
 import numpy as np
 
-from potserver.numerics.arrays import Bool, Float32, Float64
-from potserver.numerics.evidence.rows import Rows, fill
+from potserver.numerics.arrays import Bool, Float32, Float64, UInt8
+from potserver.numerics.evidence.rows import FREE, HIT, Rows, fill
 from potserver.numerics.voxel_hash import any_around, empty_table, enter, find, pack
 
 TURNS = 3  # scans in which each old row is looked at once: a third of the old rows a scan keeps the cost low
@@ -34,7 +34,7 @@ class Joined(NamedTuple):
 def add_sparing(
     rows: Rows,
     points: Float64,
-    occupied: Bool,
+    kind: UInt8 | Bool,
     weight: Float64 | Float32,
     fine_m: float,
     source: int = 0,
@@ -42,7 +42,7 @@ def add_sparing(
     within: tuple[Float64, Float64] | None = None,
     turn: int = 0,
 ) -> Joined:
-    """Add samples as `add` does, then let light rows join heavier ones of their label and source.
+    """Add samples as `add` does, then let light rows join heavier ones of their kind and source.
 
     A row that joins another gives it its weight. The other moves to the mean of all samples, but stays in its own voxel. The
     nearest row that is heavy enough is joined.
@@ -54,18 +54,18 @@ def add_sparing(
       as heavy. A free row beside hits, and a row of hits, joins only a row beside it that is 25 times as heavy.
     - Old rows of at most three looks, in the box `within`: a free row joins a row beside it that is 10 times as heavy, a row of
       hits one that is 25 times as heavy. So places that are seen again and again get no more rows for noise.
-    - Free rows in voxels with hits never join: they tell that something has left.
+    - Free rows in voxels with hits never join: they tell that something has left. Nor do near rows and shadows.
 
     A look is the weight of one beam's hit. A voxel that one scan has looked at more than once keeps its row: close to the
     sensor surfaces may turn up later.
 
     Args:
-        rows, points, occupied, weight, fine_m, source: As for `add`; they are not changed.
+        rows, points, kind, weight, fine_m, source: As for `add`; they are not changed.
         within: Corners of the box in which old rows may join others, m, in the rows' frame; None leaves old rows alone.
         turn: Number of the scan: one part in `TURNS` of the old rows is looked at in each.
     """
-    added = fill(rows, points, occupied, weight, fine_m, source)
-    n_before = len(rows.occupied)
+    added = fill(rows, points, kind, weight, fine_m, source)
+    n_before = len(rows.kind)
     left = np.ones(len(added.weight), bool)
     # voxels of free space whose neighbours are in the box too; an empty box has none
     lower, upper = (np.zeros(3), np.zeros(3)) if within is None else within
@@ -82,28 +82,29 @@ def add_sparing(
 @nb.njit(nogil=True, error_model="numpy", cache=True)
 def _join_light(rows, gained, left, n_old, source, fine_m, first, last, part, table, keys, hit_table):
     """Join rows, in place; `left` says afterwards which are left. Old ones join only in voxels from `first` to `last`."""
-    voxel, occupied, sums, sources = rows
-    hit_cells = np.empty(len(occupied), np.int64)  # free voxels with hits in them, of any source
+    voxel, kind, sums, sources = rows
+    hit_cells = np.empty(len(kind), np.int64)  # free voxels with hits in them, of any source
     n_hit_cells = 0
-    for r in range(len(occupied)):
-        if occupied[r]:
+    for r in range(len(kind)):
+        if kind[r] == HIT:
             key = pack(0, voxel[r, 0] >> 1, voxel[r, 1] >> 1, voxel[r, 2] >> 1)
             n_hit_cells = max(n_hit_cells, enter(hit_table, hit_cells, n_hit_cells, key) + 1)
-    for r in range(len(occupied)):
+    for r in range(len(kind)):
         w = sums[r, 3]
         is_old = r < n_old
-        if not 0.0 < w <= (_STILL_LIGHT if is_old else _LIGHT):
+        is_hit = kind[r] == HIT
+        if not (is_hit or kind[r] == FREE) or not 0.0 < w <= (_STILL_LIGHT if is_old else _LIGHT):
             continue
         if is_old:
             if sources[r] != source or (voxel[r, 0] + 2 * voxel[r, 1] + 3 * voxel[r, 2]) % TURNS != part:
                 continue
-            if not _is_between(voxel[r], 1 if occupied[r] else 0, first, last):
+            if not _is_between(voxel[r], 1 if is_hit else 0, first, last):
                 continue
-        label, edge = np.int64(occupied[r]), 0.5 * fine_m if occupied[r] else fine_m
-        if not occupied[r] and any_around(hit_table, hit_cells, 0, voxel[r], 0):
+        label, edge = np.int64(kind[r]), 0.5 * fine_m if is_hit else fine_m
+        if not is_hit and any_around(hit_table, hit_cells, 0, voxel[r], 0):
             continue
         factor = _BESIDE_HITS
-        if not occupied[r]:
+        if not is_hit:
             if is_old:
                 factor = _OLD_FREE
             elif not any_around(hit_table, hit_cells, 0, voxel[r], _CLEAR):

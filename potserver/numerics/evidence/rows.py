@@ -1,9 +1,13 @@
 """Rows of evidence: how samples are added, where rows stand, what they count, and how they give way to newer ones.
 
-A row belongs to one voxel, one label and one source (a robot). It holds the weight of the samples that fell there, and the
+A row belongs to one voxel, one kind and one source (a robot). It holds the weight of the samples that fell there, and the
 weighted sum of their positions relative to the voxel's centre. So a row stands at the mean of its samples, rows of two maps can
-be added, and a source's samples can be taken off again. Hits have voxels of half the resolution, free samples voxels of the
-resolution. There are at most as many rows as voxels times labels times sources.
+be added, and a source's samples can be taken off again. There are at most as many rows as voxels times kinds times sources.
+
+There are four kinds. `HIT` is where an echo came from, label 1. `FREE` is what a beam crossed, label 0. `NEAR` is free space
+just before a face, label 0, kept apart so that faces stay sharp. `SHADOW` is what lies behind a hit: nobody saw it, so its
+label is one half, it counts next to nothing, and only where there is no other row. Hits and near samples have voxels of half
+the resolution, the others voxels of the resolution.
 
 All functions are pure but for `forget`, which scales sums in place.
 """
@@ -16,9 +20,16 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from potserver.numerics.arrays import Bool, Float32, Float64, Int16, Int32, Int64
+from potserver.numerics.arrays import Bool, Float32, Float64, Int16, Int32, Int64, UInt8
 from potserver.numerics.voxel_hash import empty_table, enter, find, pack
 
+FREE, HIT, SHADOW, NEAR = 0, 1, 2, 3  # kinds; the odd ones have voxels of half the resolution
+LABELS = np.array(
+    [0.0, 1.0, 0.5, 0.0], np.float32
+)  # of the kinds: the share of occupied looks that they stand for
+
+_SEEN = 0.05  # looks of a cell from which on it counts as seen
+_SHADOW_COUNT = 0.1  # looks that a shadow counts as in a fit
 _LEAST_WEIGHT = 1e-3  # a row with less is taken for empty
 _INSIDE = 0.5 - 1e-6  # voxels: how far from the centre a row may stand
 
@@ -26,8 +37,8 @@ _INSIDE = 0.5 - 1e-6  # voxels: how far from the centre a row may stand
 class Rows(NamedTuple):
     """R pseudo-data in one frame."""
 
-    voxel: Int32  # (R, 3) voxel numbers from the frame's origin, in voxels of the resolution (free) or half of it (hits)
-    occupied: Bool  # (R,) label
+    voxel: Int32  # (R, 3) voxel numbers from the frame's origin, in voxels of the row's kind
+    kind: UInt8  # (R,) FREE, HIT, SHADOW or NEAR
     sums: Float32  # (R, 4) sum of w (x - centre) for each axis, m; sum of w
     source: Int16  # (R,) number of the robot that saw it
 
@@ -35,7 +46,10 @@ class Rows(NamedTuple):
     def empty() -> Rows:
         """No rows."""
         return Rows(
-            np.zeros((0, 3), np.int32), np.zeros(0, bool), np.zeros((0, 4), np.float32), np.zeros(0, np.int16)
+            np.zeros((0, 3), np.int32),
+            np.zeros(0, np.uint8),
+            np.zeros((0, 4), np.float32),
+            np.zeros(0, np.int16),
         )
 
     @staticmethod
@@ -45,7 +59,17 @@ class Rows(NamedTuple):
 
     def take(self, index: NDArray[np.intp] | Bool | slice) -> Rows:
         """The rows that a numpy index picks."""
-        return Rows(self.voxel[index], self.occupied[index], self.sums[index], self.source[index])
+        return Rows(self.voxel[index], self.kind[index], self.sums[index], self.source[index])
+
+    @property
+    def occupied(self) -> Bool:
+        """(R,) which rows are hits."""
+        return self.kind == HIT
+
+    @property
+    def is_half(self) -> Bool:
+        """(R,) which rows have voxels of half the resolution."""
+        return (self.kind & 1).astype(np.bool_)
 
 
 class Added(NamedTuple):
@@ -67,7 +91,7 @@ class Filled(NamedTuple):
 def add(
     rows: Rows,
     points: Float64,
-    occupied: Bool,
+    kind: UInt8 | Bool,
     weight: Float64 | Float32,
     fine_m: float,
     source: int = 0,
@@ -77,39 +101,39 @@ def add(
     A negative weight takes samples off; a row whose weight would fall below zero is left empty.
 
     Args:
-        rows: Each voxel, label and source once.
+        rows: Each voxel, kind and source once.
         points: (N, 3) m, in the rows' frame.
-        occupied: (N,) labels.
+        kind: (N,) of the samples; a boolean label is `HIT` where it is true, `FREE` elsewhere.
         weight: (N,) of each sample.
         fine_m: The resolution.
         source: Who saw them; rows of other sources stay as they are.
     """
-    filled = fill(rows, points, occupied, weight, fine_m, source)
+    filled = fill(rows, points, kind, weight, fine_m, source)
     return Added(filled.rows, filled.weight)
 
 
 def fill(
     rows: Rows,
     points: Float64,
-    occupied: Bool,
+    kind: UInt8 | Bool,
     weight: Float64 | Float32,
     fine_m: float,
     source: int,
 ) -> Filled:
     """`add`, for callers that go on looking for the source's rows by voxel."""
-    n_old, n = len(rows.occupied), len(points)
+    n_old, n = len(rows.kind), len(points)
     voxel = np.empty((n_old + n, 3), np.int32)
-    label = np.empty(n_old + n, bool)
+    kinds = np.empty(n_old + n, np.uint8)
     sums = np.zeros((n_old + n, 4), np.float32)
-    voxel[:n_old], label[:n_old], sums[:n_old] = rows.voxel, rows.occupied, rows.sums
+    voxel[:n_old], kinds[:n_old], sums[:n_old] = rows.voxel, rows.kind, rows.sums
     sources = np.full(n_old + n, source, np.int16)
     sources[:n_old] = rows.source
-    room = Rows(voxel, label, sums, sources)
+    room = Rows(voxel, kinds, sums, sources)
     gained = np.zeros(n_old + n, np.float32)
     keys, table = np.empty(n_old + n, np.int64), empty_table(n_old + n)
     used = _add(
-        room, gained, n_old, np.ascontiguousarray(points), occupied, np.asarray(weight, np.float64), fine_m, source,
-        table, keys,
+        room, gained, n_old, np.ascontiguousarray(points), np.asarray(kind, np.uint8), np.asarray(weight, np.float64),
+        fine_m, source, table, keys,
     )  # fmt: skip
     return Filled(room.take(slice(used)), gained[:used], table, keys)
 
@@ -119,14 +143,14 @@ def positions(rows: Rows, fine_m: float) -> Float64:
 
     Without that limit rounding could put the mean of samples on a face, as in a planar map at z = 0, into the next voxel.
     """
-    return np.asarray(_positions(rows.voxel, rows.occupied, rows.sums, fine_m), np.float64)
+    return np.asarray(_positions(rows.voxel, rows.kind, rows.sums, fine_m), np.float64)
 
 
 @nb.njit(nogil=True, error_model="numpy", cache=True)
-def _positions(voxel, occupied, sums, fine_m):
-    out = np.empty((len(occupied), 3))
-    for r in range(len(occupied)):
-        edge = 0.5 * fine_m if occupied[r] else fine_m
+def _positions(voxel, kind, sums, fine_m):
+    out = np.empty((len(kind), 3))
+    for r in range(len(kind)):
+        edge = 0.5 * fine_m if kind[r] & 1 else fine_m
         weight = max(sums[r, 3], np.float32(1e-9))
         for c in range(3):
             offset = min(max(np.float64(sums[r, c] / weight), -_INSIDE * edge), _INSIDE * edge)
@@ -144,20 +168,20 @@ def tile_of(rows: Rows, voxels: int, size: Int64) -> tuple[Int64, Int32]:
 
     Args:
         rows: In a frame whose origin is the box's lower corner.
-        voxels: Of free space along a tile's edge; of hits there are twice as many.
+        voxels: Of free space along a tile's edge; of those of half the resolution there are twice as many.
         size: (3,) tiles along the box's axes.
     Returns:
         (R,) numbers of the tiles, z fastest, and (R, 3) voxels.
     """
-    return _tile_of(rows.voxel, rows.occupied, voxels, size)
+    return _tile_of(rows.voxel, rows.kind, voxels, size)
 
 
 @nb.njit(nogil=True, error_model="numpy", cache=True)
-def _tile_of(voxel, occupied, voxels, size):
-    number = np.zeros(len(occupied), np.int64)
-    local = np.empty((len(occupied), 3), np.int32)
-    for r in range(len(occupied)):
-        edge = 2 * voxels if occupied[r] else voxels
+def _tile_of(voxel, kind, voxels, size):
+    number = np.zeros(len(kind), np.int64)
+    local = np.empty((len(kind), 3), np.int32)
+    for r in range(len(kind)):
+        edge = 2 * voxels if kind[r] & 1 else voxels
         for c in range(3):
             tile = voxel[r, c] // edge
             number[r] = number[r] * size[c] + tile
@@ -174,7 +198,7 @@ class Cells(NamedTuple):
 
 def cells(rows: Rows) -> Cells:
     """Number the cells that have rows."""
-    number, n = _cells(rows.voxel, rows.occupied, empty_table(len(rows.occupied)))
+    number, n = _cells(rows.voxel, rows.kind, empty_table(len(rows.kind)))
     return Cells(number, n)
 
 
@@ -190,14 +214,23 @@ def forget(sums: Float32, gained: Float32, cells: Cells, limit: float) -> None:
     _forget(sums, gained, cells.number, cells.n, limit)
 
 
-def counts(sums: Float32, cells: Cells, saturation: float) -> Float32:
+def counts(rows: Rows, cells: Cells, saturation: float) -> Float32:
     """(R,) what each row counts in a fit: its weight / (1 + weight of its cell / saturation).
 
     Looks at one place repeat each other. So a cell counts for less than `saturation` looks, shared among its rows by weight.
+    Shadows count a tenth of a look where their cell has no other row, and nothing elsewhere.
     """
-    weight = np.maximum(sums[:, 3], np.float32(0))
-    total = np.bincount(cells.number, weight, cells.n)
-    return (weight / (1.0 + total[cells.number] / saturation)).astype(np.float32)
+    is_shadow = rows.kind == SHADOW
+    weight = np.where(is_shadow, np.float32(0), np.maximum(rows.sums[:, 3], np.float32(0)))
+    total = np.bincount(cells.number, weight, cells.n)[cells.number]
+    shadow = np.where(total < _SEEN, np.float32(_SHADOW_COUNT), np.float32(0))
+    return np.where(is_shadow, shadow, weight / (1.0 + total / saturation)).astype(np.float32)
+
+
+def clip_shadows(rows: Rows) -> None:
+    """Let no shadow weigh more than one look, in place: that nobody saw a place says no more when it is said again."""
+    heavy = np.flatnonzero((rows.kind == SHADOW) & (rows.sums[:, 3] > 1.0))
+    rows.sums[heavy] /= rows.sums[heavy, 3:]
 
 
 def decay(rows: Rows, factor: float) -> Rows:
@@ -208,19 +241,19 @@ def decay(rows: Rows, factor: float) -> Rows:
 
 
 @nb.njit(nogil=True, error_model="numpy", cache=True)
-def _add(rows, gained, n, points, occupied, weight, fine_m, source, table, keys):
+def _add(rows, gained, n, points, kind, weight, fine_m, source, table, keys):
     """Fill `rows` from row n on, in place, and `table` and `keys` with the source's rows; how many rows are used."""
-    voxel, label, sums, sources = rows
+    voxel, kinds, sums, sources = rows
     for r in range(n):
         if sources[r] == source:
-            keys[r] = pack(label[r], voxel[r, 0], voxel[r, 1], voxel[r, 2])
+            keys[r] = pack(kinds[r], voxel[r, 0], voxel[r, 1], voxel[r, 2])
             table[find(table, keys, keys[r])] = r
     cell = np.empty(3, np.int64)
     for i in range(len(points)):
-        edge = 0.5 * fine_m if occupied[i] else fine_m
+        edge = 0.5 * fine_m if kind[i] & 1 else fine_m
         for c in range(3):
             cell[c] = np.int64(np.floor(points[i, c] / edge))
-        key = pack(occupied[i], cell[0], cell[1], cell[2])
+        key = pack(kind[i], cell[0], cell[1], cell[2])
         place = find(table, keys, key)
         r = table[place]
         if r < 0:
@@ -229,7 +262,7 @@ def _add(rows, gained, n, points, occupied, weight, fine_m, source, table, keys)
             r = n
             table[place] = r
             keys[r] = key
-            label[r] = occupied[i]
+            kinds[r] = kind[i]
             for c in range(3):
                 voxel[r, c] = cell[c]
             n += 1
@@ -246,13 +279,13 @@ def _add(rows, gained, n, points, occupied, weight, fine_m, source, table, keys)
 
 
 @nb.njit(nogil=True, error_model="numpy", cache=True)
-def _cells(voxel, occupied, table):
-    n_rows = len(occupied)
+def _cells(voxel, kind, table):
+    n_rows = len(kind)
     number = np.empty(n_rows, np.int64)
     keys = np.empty(n_rows, np.int64)
     n = 0
     for r in range(n_rows):
-        shift = 1 if occupied[r] else 0
+        shift = kind[r] & 1
         key = pack(0, voxel[r, 0] >> shift, voxel[r, 1] >> shift, voxel[r, 2] >> shift)
         number[r] = enter(table, keys, n, key)
         n = max(n, number[r] + 1)

@@ -1,0 +1,65 @@
+"""What a scan says next to the faces that it hit: free space just before them, and shadow behind them.
+
+Labels along beams stop `free_gap_m` before a hit, so between there and the face nothing says where free space ends. And
+nothing at all is said behind a face, where wide kernels would go on with what they know of the front.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from potserver.numerics import evidence, surface
+from potserver.numerics.arrays import Float32, Float64, UInt8
+from potserver.numerics.beams import Beams
+
+# Clearance of near samples along the face's normal. Lower ones sharpen faces and cost held-out ends, which lie on faces.
+_NEAR_M = (0.03, 0.10)
+_NEAR_SIGMAS = 1.0  # of the noise about the face, added to the clearance
+_NEAR_WEIGHT = 0.3  # looks of a near sample
+_SHADOW_M = (0.2, 1.2)  # depth of shadow samples behind the face, along its normal
+
+
+class Samples(NamedTuple):
+    """Weighted samples of all kinds, in a region's frame."""
+
+    points: Float64  # (N, 3) m
+    kind: UInt8  # (N,) see `evidence`
+    weight: Float64 | Float32  # (N,) looks
+
+    @staticmethod
+    def concatenate(sets: list[Samples]) -> Samples:
+        """All samples, in order."""
+        return Samples(*(np.concatenate(parts) for parts in zip(*sets, strict=True)))
+
+
+def surface_samples(
+    beams: Beams, origin: Float64, known: Float64, voxel_m: float, rng: np.random.Generator, *, planar: bool
+) -> Samples:
+    """Near samples and shadows of a scan's hits.
+
+    Args:
+        beams: Relative to `origin`.
+        origin: (3,) m, in the region's frame.
+        known: (R, 3) m, hit rows of the map there: the scan alone may be too sparse to show how a face lies.
+        voxel_m: Edge of the voxels whose hits share a normal.
+        rng: Of clearances and depths.
+        planar: Faces are upright, as seen by a planar sensor.
+    """
+    ends = beams.ends[beams.is_return]
+    if len(ends) == 0:
+        return Samples(np.zeros((0, 3)), np.zeros(0, np.uint8), np.zeros(0))
+    rays = ends / np.linalg.norm(ends, axis=1, keepdims=True)
+    faces = surface.normals(ends, rays, known - origin, voxel_m, planar=planar)
+    low, high = _NEAR_M
+    near, _ = surface.near_free(
+        ends, np.zeros(3), faces, low_m=low, high_m=high, sigmas=_NEAR_SIGMAS, rng=rng
+    )
+    low, high = _SHADOW_M
+    shadow = surface.behind(ends, faces, low_m=low, high_m=high, rng=rng)
+    return Samples(
+        np.concatenate([near, shadow]) + origin,
+        np.repeat(np.array([evidence.NEAR, evidence.SHADOW], np.uint8), [len(near), len(shadow)]),
+        np.repeat([_NEAR_WEIGHT, 1.0], [len(near), len(shadow)]),
+    )
