@@ -11,7 +11,7 @@ from potserver.domain.map_state import MapState
 from potserver.domain.tiles import TiledMap
 from potserver.domain.types import KernelSet, Scan
 from potserver.mapping.carrying import Carrier
-from potserver.mapping.fusion import Fused, FusionOptions, Look, Moment, fuse, refit, stalest_part
+from potserver.mapping.fusion import Fused, Look, Moment, fuse, refit, stalest_part
 from potserver.mapping.pipeline import Integrated, LabelledScan, Pipeline, ScanMap, integrated
 from potserver.mapping.refinement import borrowed_prior, instantaneous_map
 from potserver.mapping.sampling import Draws
@@ -80,13 +80,12 @@ class DefaultPipeline(Pipeline):
     ) -> Fused:
         """The overall map's tiles with the scan in them."""
         with clock("fuse"):
-            options = FusionOptions.of(self.settings, self.method.effort)
-            return fuse(tiled, look, carried, options, moment, threads=self.threads)
+            return fuse(tiled, look, carried, self.fusion, moment, threads=self.threads)
 
     def age(self, tiled: TiledMap, fused: Fused, moment: Moment) -> tuple[TiledMap, Fused]:
         """The map with its stalest part fitted again, if evidence ages."""
         stale = stalest_part(tiled, moment)
         if stale is None:
             return tiled, fused
-        aged, _ = refit(tiled, stale, moment, threads=self.threads)
+        aged, _ = refit(tiled, stale, self.fusion, moment, threads=self.threads)
         return tiled.with_tiles(aged), fused._replace(tiles=fused.tiles | aged)

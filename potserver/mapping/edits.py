@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterable
 
 import numpy as np
@@ -108,11 +109,11 @@ def merge(
         tiles = region.tiles(lower, upper, revision=moment.revision, stamp_ns=moment.stamp_ns)
         ours = ours._replace(tiles={**ours.tiles, **tiles})  # indexed once, when all is settled
         touched.update(tiles)
-    return _settle(ours, touched, moment, threads)
+    return _settle(ours, touched, options, moment, threads)
 
 
 def remove_robot(
-    tiled: TiledMap, robot_id: str, moment: Moment, *, threads: int
+    tiled: TiledMap, robot_id: str, options: FusionOptions, moment: Moment, *, threads: int
 ) -> tuple[TiledMap, set[TileIndex]]:
     """The map without what one robot has seen, and the tiles that changed; places that nobody else saw are unknown again.
 
@@ -143,18 +144,19 @@ def remove_robot(
         for dz in (-1, 0, 1)
     }
     left = tiled._replace(tiles={**tiled.tiles, **without})
-    return _settle(left, around & left.tiles.keys(), moment, threads)
+    return _settle(left, around & left.tiles.keys(), options, moment, threads)
 
 
 def _settle(
-    tiled: TiledMap, changed: Iterable[TileIndex], moment: Moment, threads: int
+    tiled: TiledMap, changed: Iterable[TileIndex], options: FusionOptions, moment: Moment, threads: int
 ) -> tuple[TiledMap, set[TileIndex]]:
     """Solve all weights of the parts with changed tiles, until they agree with each other."""
+    options = dataclasses.replace(options, effort=_EFFORT)
     parts = sorted({part_of(index) for index in changed})
     done: set[TileIndex] = set()
     for _ in range(_SWEEPS):
         for part in parts:
-            tiles, _ = refit(tiled, part, moment, threads=threads, effort=_EFFORT)
+            tiles, _ = refit(tiled, part, options, moment, threads=threads)
             tiled = tiled._replace(tiles={**tiled.tiles, **tiles})
             done.update(tiles)
     done.update(changed)

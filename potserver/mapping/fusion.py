@@ -30,7 +30,7 @@ from potserver.errors import SolverError
 from potserver.mapping.placing import activation, gamma_of_spacing, kernels_at
 from potserver.mapping.refinement import FEATURE_CUT
 from potserver.mapping.settings import MappingSettings
-from potserver.mapping.surfaces import Samples, surface_samples
+from potserver.mapping.surfaces import Samples, SharpFaces, surface_samples
 from potserver.numerics import evidence
 from potserver.numerics.arrays import UInt8
 from potserver.numerics.beams import Beams, LabelledPoints, beam_weights
@@ -40,8 +40,8 @@ from potserver.numerics.lattice_nodes import new_nodes
 from potserver.numerics.warm_fit import Prior, Solver, warm_fit
 
 _FINEST_M, _COARSEST_M, _FINE_PER_RANGE = 0.2, 0.4, 1.0 / 20.0
-_COARSE_REACH = 0.7  # spacings: nearer coarse nodes than this get a kernel, see lattice_nodes.new_nodes
-_FINE_REACH = 0.9  # the same for fine nodes about hits: faces have nodes on both sides
+_COARSE_REACH = 1.0  # spacings: nearer coarse nodes than this get a kernel, see lattice_nodes.new_nodes
+_FINE_REACH = 0.0  # the same for fine nodes about hits: the nearest alone
 _TOO_WIDE = 1.5  # coarse spacings
 _REACHED = 0.1  # activation by a carried kernel below which a point or a row is not its own
 _EXPLAINED = 1.0  # activation by carried kernels at which the lattice adds none
@@ -58,7 +58,7 @@ _CHEAP_VALUES = 60_000_000  # features that a solve may touch for more Newton st
 class FitEffort(NamedTuple):
     """Steps of one solve, from where the map is."""
 
-    newton_steps: int = 3  # at least
+    newton_steps: int = 2  # at least
     most_newton_steps: int = 6  # where the map is small and steps are cheap
     gradient_steps: int = 4  # conjugate-gradient steps for each Newton step
 
@@ -73,16 +73,20 @@ class FusionOptions:
     free_gap_m: float
     fade_rate: float
     max_kernels_per_tile: int
-    effort: FitEffort
+    effort: FitEffort = SCAN_EFFORT
+    sharp: SharpFaces | None = None  # none: labels along beams alone
 
     @staticmethod
-    def of(settings: MappingSettings, effort: FitEffort = SCAN_EFFORT) -> FusionOptions:
+    def of(
+        settings: MappingSettings, effort: FitEffort = SCAN_EFFORT, sharp: SharpFaces | None = None
+    ) -> FusionOptions:
         """What fusion needs of the settings."""
         return FusionOptions(
             free_gap_m=settings.free_gap_m,
             fade_rate=settings.fade_rate,
             max_kernels_per_tile=settings.max_kernels_per_tile,
             effort=effort,
+            sharp=sharp,
         )
 
 
@@ -172,7 +176,7 @@ def fuse(
         where = evidence.positions(region.rows, grid.fine_m)
         taken = taken.take(_support(taken, where, grid, threads) >= _REACHED)
     added = add_kernels(region, new_rows, MapKernels.new(taken, CARRIED), options, look.is_planar, threads)
-    fitted = _fit(region, *inside, options.effort, threads)
+    fitted = _fit(region, *inside, options, threads)
     return Fused(
         region.tiles(lower, upper, revision=moment.revision, stamp_ns=moment.stamp_ns),
         len(added), int((added.level == CARRIED).sum()), fitted,
@@ -192,10 +196,14 @@ def _samples_of(look: Look, region: Region, options: FusionOptions, threads: int
             threads=threads,
         )  # fmt: skip
         parts.append(Samples(seen.points, np.full(len(seen.points), evidence.FREE, np.uint8), seen.weight))
-    known = region.rows.take(region.rows.occupied & evidence.is_alive(region.rows))
-    where = evidence.positions(known, grid.fine_m)
-    voxel_m = 0.5 * grid.fine_m
-    parts.append(surface_samples(look.beams, start, where, voxel_m, look.rng, planar=look.is_planar))
+    if options.sharp is not None:
+        known = region.rows.take(region.rows.occupied & evidence.is_alive(region.rows))
+        where = evidence.positions(known, grid.fine_m)
+        parts.append(
+            surface_samples(
+                look.beams, start, where, 0.5 * grid.fine_m, options.sharp, look.rng, planar=look.is_planar
+            )
+        )
     return Samples.concatenate(parts)
 
 
@@ -226,7 +234,7 @@ def append(tiled: TiledMap, carried: KernelSet, moment: Moment) -> dict[TileInde
 
 
 def refit(
-    tiled: TiledMap, part: TileIndex, moment: Moment, *, threads: int, effort: FitEffort = SCAN_EFFORT
+    tiled: TiledMap, part: TileIndex, options: FusionOptions, moment: Moment, *, threads: int
 ) -> tuple[dict[TileIndex, Tile], bool]:
     """Solve the weights of one part's kernels again, those around it held; its tiles, and whether the solve went well.
 
@@ -239,7 +247,7 @@ def refit(
     pad = 4 * grid.coarse_m
     region = Region.of(tiled, corner - pad, corner + edge + pad, moment.weight_of)
     start = corner - region.origin_m
-    fitted = _fit(region, start, start + edge, effort, threads)
+    fitted = _fit(region, start, start + edge, options, threads)
     inner = corner + 1e-3 * grid.fine_m, corner + edge - 1e-3 * grid.fine_m
     tiles = region.tiles(*inner, revision=moment.revision, stamp_ns=moment.stamp_ns)
     return {index: tile for index, tile in tiles.items() if index in tiled.tiles}, fitted
@@ -290,11 +298,13 @@ def add_kernels(
     threads: int,
 ) -> MapKernels:
     """Put kernels where new rows ask for them, beside those that are taken as they are; all that were added."""
-    grid, present = region.grid, region.kernels
+    grid, present, sharp = region.grid, region.kernels, options.sharp
+    coarse_reach = _COARSE_REACH if sharp is None else sharp.coarse_reach
+    fine_reach = _FINE_REACH if sharp is None else sharp.fine_reach
     asking = evidence.positions(new_rows, grid.fine_m)
     parts = [taken]
     from_atoms = KernelSet.concatenate([present.kernels.take(present.level == CARRIED), taken.kernels])
-    for level, spacing, within in ((COARSE, grid.coarse_m, _COARSE_REACH), (FINE, grid.fine_m, _FINE_REACH)):
+    for level, spacing, within in ((COARSE, grid.coarse_m, coarse_reach), (FINE, grid.fine_m, fine_reach)):
         there = present.kernels.hinge_mean[present.level == level]
         nodes = new_nodes(
             asking if level == COARSE else asking[new_rows.occupied],
@@ -394,7 +404,7 @@ def _support_of(blocks: Blocks, kind: UInt8, counts: Float32, threads: int) -> _
     return _Support(seen, unseen)
 
 
-def _fit(region: Region, lower: Float64, upper: Float64, effort: FitEffort, threads: int) -> bool:
+def _fit(region: Region, lower: Float64, upper: Float64, options: FusionOptions, threads: int) -> bool:
     """Solve the weights of the kernels in a box, those around it held; whether the solve went well.
 
     Rows and kernels beyond the reach of what is solved for are left out.
@@ -418,6 +428,7 @@ def _fit(region: Region, lower: Float64, upper: Float64, effort: FitEffort, thre
         bytes_a_value=1,
         threads=threads,
     )
+    effort = options.effort
     per_step = blocks.n_values * (2 + 2 * effort.gradient_steps)
     cheap = _CHEAP_VALUES // max(per_step, 1)
     n_newton = int(np.clip(cheap, effort.newton_steps, effort.most_newton_steps))
@@ -430,8 +441,10 @@ def _fit(region: Region, lower: Float64, upper: Float64, effort: FitEffort, thre
         raise SolverError(f"the weights of {len(local)} kernels on {len(rows)} rows came out NaN or infinite")
     mean, var = kernels.weight_mean.copy(), kernels.weight_var.copy()
     solved = local[free]
-    support = _support_of(blocks, region.rows.kind[rows], counts, threads)
-    mean[solved], var[solved] = fit.weights[free], support.variance(region.kernels.prior_var[local])[free]
+    mean[solved], var[solved] = fit.weights[free], fit.var[free]
+    if options.sharp is not None:
+        support = _support_of(blocks, region.rows.kind[rows], counts, threads)
+        var[solved] = support.variance(region.kernels.prior_var[local])[free]
     keep = np.ones(len(kernels), bool)
     keep[local[free & (fit.support < _UNSUPPORTED)]] = False
     region.kernels = MapKernels(

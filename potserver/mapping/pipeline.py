@@ -18,12 +18,13 @@ from potserver.domain.tiles import TiledMap
 from potserver.domain.types import KernelSet, MapUpdate, Scan, Sector, SectorMatch, TileChange
 from potserver.mapping.carrying import Carried, Carrier
 from potserver.mapping.checking import check
-from potserver.mapping.fusion import SCAN_EFFORT, FitEffort, Fused, Moment, grid_for
+from potserver.mapping.fusion import SCAN_EFFORT, FitEffort, Fused, FusionOptions, Moment, grid_for
 from potserver.mapping.matching import Ranking
 from potserver.mapping.sampling import BeamLimits, DrawnBeams, Draws, draw_beams, thin_beams
 from potserver.mapping.sectors import SectorCut, cut_sectors
 from potserver.mapping.settings import MappingSettings
 from potserver.mapping.stopwatch import Stopwatch
+from potserver.mapping.surfaces import SharpFaces
 from potserver.mapping.transport import CouplingOptions
 from potserver.numerics.beams import LabelledPoints, label_beams
 
@@ -40,6 +41,7 @@ class Method(NamedTuple):
     ranking: Ranking = Ranking()
     coupling: CouplingOptions = CouplingOptions()
     effort: FitEffort = SCAN_EFFORT
+    sharp: SharpFaces | None = None
     rule: AnswerRule = DEFAULT_RULE  # how the map answers until its self-check has points enough
     is_calibrated: bool = True  # then the self-check chooses the rule's `mean_moderation`
 
@@ -87,6 +89,7 @@ class Pipeline(ABC):
         """
         self.settings, self.method = settings, method or Method()
         self.threads, self.seed = threads, seed
+        self.fusion = FusionOptions.of(settings, self.method.effort, self.method.sharp)
 
     @abstractmethod
     def integrate(self, state: MapState, scan: Scan, carrier: Carrier) -> Integrated:

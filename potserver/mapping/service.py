@@ -18,10 +18,11 @@ from potserver.domain.types import Float64, MapUpdate, Scan, TileChange, yaw_pos
 from potserver.errors import SettingsError, UnknownRobotError
 from potserver.mapping import edits
 from potserver.mapping.default import DefaultPipeline
-from potserver.mapping.fusion import FusionOptions, Moment
+from potserver.mapping.fusion import FitEffort, Moment
 from potserver.mapping.paper import PAPER, PotPipeline
 from potserver.mapping.pipeline import Method, Pipeline
 from potserver.mapping.settings import MappingSettings
+from potserver.mapping.surfaces import SharpFaces
 from potserver.numerics.threads import default_threads
 
 Commit = Callable[[MapState], None]  # told of a new state before it becomes the map
@@ -33,9 +34,16 @@ class MakePipeline(Protocol):
     def __call__(self, settings: MappingSettings, *, threads: int, seed: int) -> Pipeline: ...
 
 
+_METHODS = {
+    "default": Method(),
+    "sharp": Method(effort=FitEffort(newton_steps=3), sharp=SharpFaces()),
+    "paper": PAPER,
+}
+
+
 def method_of(profile: str) -> Method:
     """How the steps of a profile work."""
-    return PAPER if profile == "paper" else Method()
+    return _METHODS[profile]
 
 
 def pipeline_of(settings: MappingSettings, *, threads: int, seed: int) -> Pipeline:
@@ -171,7 +179,7 @@ class MappingService:
         )
         ours = state.tiled or TiledMap.empty(TileGrid.of(self.settings.tile_size_m, other.tiled.grid.fine_m))
         tiled, changed = edits.merge(
-            ours, other.tiled, T_map_other, FusionOptions.of(self.settings), moment, threads=self._threads
+            ours, other.tiled, T_map_other, self._pipeline.fusion, moment, threads=self._threads
         )
         return self._edited(tiled, changed, moment, state.n_scans + other.n_scans, commit)
 
@@ -189,7 +197,9 @@ class MappingService:
         moment = Moment(state.map_revision + 1, state.stamp_ns, self.settings.half_life_s)
         if state.tiled is None:
             raise UnknownRobotError(f"the map is empty: it has nothing from {robot_id!r}")
-        tiled, changed = edits.remove_robot(state.tiled, robot_id, moment, threads=self._threads)
+        tiled, changed = edits.remove_robot(
+            state.tiled, robot_id, self._pipeline.fusion, moment, threads=self._threads
+        )
         return self._edited(tiled, changed, moment, state.n_scans, commit)
 
     def warm_up(self) -> None:

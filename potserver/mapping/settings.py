@@ -13,7 +13,10 @@ from potserver.errors import SettingsError
 class MappingSettings:
     """One map's settings. `profile` sets what the others start from."""
 
-    profile: Annotated[str, "`default` is ours; `paper` repeats the authors' choices"] = "default"
+    profile: Annotated[
+        str,
+        "`default`; `sharp`: walls where they are; `paper`: as the authors' code",
+    ] = "default"
 
     # range limits
     min_range_m: Annotated[float, "shorter beams are left out: they hit the robot itself"] = 0.3
@@ -80,6 +83,7 @@ class MappingSettings:
 _MAY_BE_ZERO = ("min_range_m", "free_gap_m", "resolution_m", "fade_rate", "half_life_s", "check_share")
 _OF_PROFILE: dict[str, dict[str, Any]] = {
     "default": {},
+    "sharp": {},
     # what the authors' code does, as far as an operator would choose it; mapping/paper.py has the rest
     "paper": {"max_range_m": 20.0, "beams_per_scan": 8_000, "check_share": 0.0},
 }

@@ -14,11 +14,17 @@ from potserver.numerics import evidence, surface
 from potserver.numerics.arrays import Float32, Float64, UInt8
 from potserver.numerics.beams import Beams
 
-# Clearance of near samples along the face's normal. Lower ones sharpen faces and cost held-out ends, which lie on faces.
-_NEAR_M = (0.03, 0.10)
-_NEAR_SIGMAS = 1.0  # of the noise about the face, added to the clearance
-_NEAR_WEIGHT = 0.3  # looks of a near sample
-_SHADOW_M = (0.2, 1.2)  # depth of shadow samples behind the face, along its normal
+
+class SharpFaces(NamedTuple):
+    """How the overall map is made to end free space at faces, and knowledge behind them (profile `sharp`)."""
+
+    # Clearance of near samples along the face's normal, m. Lower ones sharpen faces and cost held-out ends, which lie on them.
+    near_m: tuple[float, float] = (0.03, 0.10)
+    near_sigmas: float = 2.0  # of the noise about the face, added to the clearance
+    near_weight: float = 0.3  # looks of a near sample
+    shadow_m: tuple[float, float] = (0.2, 1.2)  # depth of shadow samples behind the face, along its normal
+    coarse_reach: float = 0.7  # spacings: nearer coarse nodes than this get a kernel
+    fine_reach: float = 0.9  # the same for fine nodes about hits, so that faces have nodes on both sides
 
 
 class Samples(NamedTuple):
@@ -35,7 +41,14 @@ class Samples(NamedTuple):
 
 
 def surface_samples(
-    beams: Beams, origin: Float64, known: Float64, voxel_m: float, rng: np.random.Generator, *, planar: bool
+    beams: Beams,
+    origin: Float64,
+    known: Float64,
+    voxel_m: float,
+    sharp: SharpFaces,
+    rng: np.random.Generator,
+    *,
+    planar: bool,
 ) -> Samples:
     """Near samples and shadows of a scan's hits.
 
@@ -44,7 +57,8 @@ def surface_samples(
         origin: (3,) m, in the region's frame.
         known: (R, 3) m, hit rows of the map there: the scan alone may be too sparse to show how a face lies.
         voxel_m: Edge of the voxels whose hits share a normal.
-        rng: Of clearances and depths.
+        sharp: Clearances, depths and weights.
+        rng: Of the draws.
         planar: Faces are upright, as seen by a planar sensor.
     """
     ends = beams.ends[beams.is_return]
@@ -52,14 +66,14 @@ def surface_samples(
         return Samples(np.zeros((0, 3)), np.zeros(0, np.uint8), np.zeros(0))
     rays = ends / np.linalg.norm(ends, axis=1, keepdims=True)
     faces = surface.normals(ends, rays, known - origin, voxel_m, planar=planar)
-    low, high = _NEAR_M
+    low, high = sharp.near_m
     near, _ = surface.near_free(
-        ends, np.zeros(3), faces, low_m=low, high_m=high, sigmas=_NEAR_SIGMAS, rng=rng
+        ends, np.zeros(3), faces, low_m=low, high_m=high, sigmas=sharp.near_sigmas, rng=rng
     )
-    low, high = _SHADOW_M
+    low, high = sharp.shadow_m
     shadow = surface.behind(ends, faces, low_m=low, high_m=high, rng=rng)
     return Samples(
         np.concatenate([near, shadow]) + origin,
         np.repeat(np.array([evidence.NEAR, evidence.SHADOW], np.uint8), [len(near), len(shadow)]),
-        np.repeat([_NEAR_WEIGHT, 1.0], [len(near), len(shadow)]),
+        np.repeat([sharp.near_weight, 1.0], [len(near), len(shadow)]),
     )
