@@ -49,7 +49,7 @@ Make a *.map file. In the folder `saved` of a server's store, `potclient map loa
   *.bt        a binary OctoMap: its voxels become evidence of a robot named after the file, and kernels are solved
               on it
   *.npz       kernels, as `potclient export npz` writes them. There is no evidence with them, so only servers of profile
-              `paper` load them; they answer by their own mapping.mean_moderation and mapping.residual_var
+              `paper` load them, and answer by that profile's rule
   DIR, *.map  the last snapshot of a map's folder, or a saved map, written anew"""
 
 _IMPORT_EXAMPLES = """\
@@ -73,9 +73,8 @@ _ONE_MAP = "a *.map file, or a map's folder in a store"
 # misses as free, ln(.881 / .119) / ln(.6 / .4). A binary file says only on which side of 0.5 a voxel is.
 _OCCUPIED_LOOKS = 4.1
 _FREE_LOOKS = 4.9
-# A scan spreads a beam's free evidence, one look in all, over its whole way: a voxel of free space gets a part of it. Chosen on
-# two OctoMaps, of rooms and of an office: 99 % of the occupied space and 96 and 89 % of the free come back as they were. With
-# 1/10 it was 100, 94 and 85 %, with 1 it was 97, 97 and 92 %.
+# A scan spreads a beam's free evidence, one look in all, over its whole way: a voxel of free space gets a part of it. With this
+# share an OctoMap of rooms or of an office comes back with 99 % of its occupied space, and with 96 or 89 % of its free space.
 _FREE_SHARE = 1.0 / 3.0
 _FINEST_M = 0.2
 _MAX_PLACES = 20_000_000

@@ -124,9 +124,8 @@ def open_atoms(path: Path, *, verify: bool = True) -> AtomFile:
                     f"{path} is an atom dictionary of version 1 (.npz) or a zip file; this program reads version {VERSION}:"
                     " build it again with `potserver atoms build`"
                 )
-            with safe_open(
-                path, framework="numpy"
-            ) as container:  # checks that the header describes the whole file
+            # opening checks that the header describes the whole file
+            with safe_open(path, framework="numpy") as container:
                 metadata = container.metadata() or {}
                 described = [
                     (name, (part := container.get_slice(name)).get_dtype(), tuple(part.get_shape()))

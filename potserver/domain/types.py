@@ -278,9 +278,8 @@ class MapUpdate:
     sectors: list[SectorMatch]
     n_points: int  # beams used
     n_kernels_added: int  # that the overall map took, of both kinds
-    n_kernels_transported: (
-        int  # of those, carried from atoms; the others were placed where nothing explained the data
-    )
+    # of those, carried from atoms; the others were placed where nothing explained the data
+    n_kernels_transported: int
     map_kernels: int
     converged: bool  # neither joint solve got stuck; if one did, its weights are the best found
     rule: AnswerRule  # what turns `kernels` into answers

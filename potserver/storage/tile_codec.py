@@ -81,9 +81,8 @@ def decode_tile(data: bytes, grid: TileGrid, n_robots: int) -> tuple[TileIndex, 
     n_bytes = sum(n * max(1, c.width) * np.dtype(c.dtype).itemsize for c, n in sizes)
     try:
         inflate = zlib.decompressobj()
-        plain = inflate.decompress(
-            content[_HEAD.size :], n_bytes + 1
-        )  # one more would show that there is more
+        # one byte more would show that there is more
+        plain = inflate.decompress(content[_HEAD.size :], n_bytes + 1)
         if len(plain) != n_bytes or not inflate.eof:
             raise MapFileError(f"tile {(x, y, z)} is not of the size that it says", reason="damaged")
         arrays, start = {}, 0

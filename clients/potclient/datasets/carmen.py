@@ -133,10 +133,8 @@ def _read_lines(path: Path) -> list[_Line]:
 def _parse(number: int, words: list[str]) -> _Line:
     if words[0] == "FLASER":
         n, first = int(words[1]), 2
-        start, step = (
-            -math.pi / 2,
-            math.pi / (n - n % 2),
-        )  # 180: one degree up to +89; 181: one degree up to +90
+        # 180: one degree up to +89; 181: one degree up to +90
+        start, step = -math.pi / 2, math.pi / (n - n % 2)
         pose_at, stamp_at = first + n, first + n + 6
     else:
         n, first = int(words[8]), 9
