@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,8 +23,8 @@ _LEAST_ON_LATTICE = 4  # kernels: of fewer, the hinges themselves are shorter th
 def encode_kernels(kernels: KernelSet, rule: AnswerRule) -> messages.Kernels:
     """Kernels as they are: float64 hinges become float32 offsets from their centroid, in whole metres."""
     origin = np.round(kernels.hinge_mean.mean(axis=0)) if len(kernels) else np.zeros(3)
-    about_origin = kernels.moved(-origin)
-    return messages.Kernels(origin=origin.tolist(), **float32_fields(about_origin), **rule.fields())
+    fields: dict[str, Any] = {**float32_fields(kernels.moved(-origin)), **rule.fields()}
+    return messages.Kernels(origin=origin.tolist(), **fields)
 
 
 def code_kernels(kernels: KernelSet, spacings_m: Sequence[float]) -> messages.CodedKernels:

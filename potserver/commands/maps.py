@@ -8,8 +8,6 @@ import functools
 import json
 import re
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -18,7 +16,15 @@ from numpy.typing import NDArray
 
 from potclient.commands import export_flags, pose_flag
 from potclient.octomap import DEPTH, KEY_ORIGIN, Leaves, read_bt
-from potserver.commands.shared import EXIT_OK, add_group, add_settings_flags, add_verb, say, settings_of
+from potserver.commands.shared import (
+    EXIT_OK,
+    add_group,
+    add_settings_flags,
+    add_verb,
+    file_errors,
+    say,
+    settings_of,
+)
 from potserver.errors import MapFileError, SettingsError
 
 if TYPE_CHECKING:
@@ -255,7 +261,7 @@ def _from_saved(file: Path) -> tuple[MapState, Origin]:
 def _from_octomap(path: Path, looks: float, settings: Settings) -> MapState:
     from potserver.mapping.imports import state_of_places
 
-    with _read_errors(path):
+    with file_errors(f"read {path}"):
         leaves, resolution = read_bt(path)
     fine_m = settings.mapping.resolution_m or max(resolution, _FINEST_M)
     places = places_of(leaves, resolution, fine_m, looks)
@@ -315,13 +321,12 @@ def _from_kernels(path: Path, settings: Settings) -> MapState:
     from potserver.mapping.imports import state_of_kernels
     from potserver.mapping.paper import PAPER, PotPipeline
 
-    with _read_errors(path):
+    with file_errors(f"read {path}"):
         kernels = ClientKernels.load(path)
     service = _service(
         settings.mapping, settings, functools.partial(PotPipeline, method=PAPER._replace(rule=kernels.rule))
     )
-    arrays = {f.name: getattr(kernels, f.name) for f in dataclasses.fields(KernelSet)}
-    return state_of_kernels(service, KernelSet(**arrays))
+    return state_of_kernels(service, KernelSet.of(kernels))
 
 
 def _service(
@@ -334,14 +339,6 @@ def _service(
     return MappingService(
         AtomDictionary(()), mapping, threads=settings.threads, make_pipeline=make_pipeline or pipeline_of
     )
-
-
-@contextmanager
-def _read_errors(path: Path) -> Iterator[None]:
-    try:
-        yield
-    except OSError as error:
-        raise MapFileError(f"cannot read {path}: {error.strerror or error}", reason="missing") from error
 
 
 # --- merge ------------------------------------------------------------------------------------------------------------

@@ -397,7 +397,3 @@ class MemoryOnly:
             UnsupportedError: always.
         """
         raise UnsupportedError(_IN_MEMORY)
-
-    def close(self) -> bool:
-        """Nothing to do."""
-        return True
