@@ -10,10 +10,8 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
-import importlib
 import math
 import re
-import sys
 import typing
 from collections.abc import Iterator, Mapping
 from enum import Enum
@@ -27,8 +25,7 @@ from potserver.adapters.session import ZenohSettings
 from potserver.errors import SettingsError
 from potserver.limits import Limits
 from potserver.mapping.settings import MappingSettings
-
-tomllib: Any = importlib.import_module("tomllib" if sys.version_info >= (3, 11) else "tomli")
+from potserver.toml import read_toml, toml_value
 
 ENV_PREFIX = "POTSERVER_"
 # POTSERVER_SETTINGS names the file; Kubernetes injects POTSERVER_PORT... for a service of our name
@@ -165,7 +162,7 @@ def load_settings(
     path = file or environ.get(f"{ENV_PREFIX}SETTINGS")
     tree: dict[str, Any] = {}
     if path:
-        _merge(tree, _read_toml(Path(path)), str(path))
+        _merge(tree, read_toml(Path(path), "settings file"), str(path))
     for name, text in sorted(environ.items()):
         if name.startswith(ENV_PREFIX) and not _NOT_SETTINGS.match(name.removeprefix(ENV_PREFIX)):
             _set(tree, name.removeprefix(ENV_PREFIX).lower().split("__"), text, name)
@@ -236,16 +233,6 @@ def _kind_text(kind: Any) -> str:
 # --- reading ------------------------------------------------------------------------------------------------
 
 
-def _read_toml(path: Path) -> dict[str, Any]:
-    try:
-        tree: dict[str, Any] = tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise SettingsError(f"cannot read settings file {path}: {error.strerror}") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise SettingsError(f"{path} is not TOML: {error}") from error
-    return tree
-
-
 def _merge(into: dict[str, Any], tree: Mapping[str, Any], source: str, prefix: str = "") -> None:
     """Check the keys of a table against the settings, and lay it over another."""
     for key, value in tree.items():
@@ -306,8 +293,8 @@ def _parse(text: str, kind: Any) -> Any:
         if str in accepted or (isinstance(kind, type) and issubclass(kind, Enum)):
             return text
     try:
-        return tomllib.loads(f"value = {text}")["value"]
-    except tomllib.TOMLDecodeError:
+        return toml_value(text)
+    except ValueError:
         return text  # the type check will say what is wrong
 
 
@@ -347,19 +334,20 @@ def _check(s: Settings) -> None:
                 value = getattr(value, key)
             raise SettingsError(f"{path} is {value!r}, need {what}")
 
-    for what, ids in (("server_id", (s.server_id,)), ("maps", s.maps), ("intake.robots", s.intake.robots)):
-        for value in ids:
-            try:
-                keys.check_id(value, what)
-            except ValueError as error:
-                raise SettingsError(str(error)) from error
+    try:
+        keys.check_id(s.server_id, "server_id")
+        for map_id in s.maps:
+            keys.check_map_id(map_id)
+        for robot_id in s.intake.robots:
+            keys.check_id(robot_id, "intake.robots")
+    except ValueError as error:
+        raise SettingsError(str(error)) from error
     need(
         "root",
         bool(re.fullmatch(r"[a-z0-9_.-]+(/[a-z0-9_.-]+)*", s.root)),
         "chunks of a-z 0-9 _ . - between slashes",
     )
     need("maps", 0 < len(s.maps) == len(set(s.maps)), "at least one map, each once")
-    need("maps", "srv" not in s.maps, "another name: srv/<server>/stats is the server's own key")
     for table in ("limits", "intake", "queries", "poses"):
         for field in dataclasses.fields(getattr(s, table)):
             value = getattr(getattr(s, table), field.name)

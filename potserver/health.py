@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import collections
+import dataclasses
 import math
 import os
 import threading
 import time
 from pathlib import Path
-from typing import NamedTuple
 
 
-class Latency(NamedTuple):
+@dataclasses.dataclass(frozen=True, slots=True)
+class Latency:
     """Percentiles of the last window of one kind of work."""
 
-    n: int  # observations in the window
+    count: int  # observations in the window
     p50_ms: float
     p95_ms: float
     p99_ms: float

@@ -1,11 +1,10 @@
-"""What all tests share: places, ports, optional data, the commands' help, and how Hypothesis runs."""
+"""What all tests share: places, optional data, the commands' help, and how Hypothesis runs."""
 
 from __future__ import annotations
 
 import functools
 import os
 import re
-import socket
 import subprocess
 import sys
 from collections.abc import Callable
@@ -40,9 +39,15 @@ def root() -> Path:
 
 
 @pytest.fixture(scope="session")
-def project() -> dict:
+def project_file() -> dict:
+    """pyproject.toml."""
+    return tomllib.loads((ROOT / "pyproject.toml").read_text())
+
+
+@pytest.fixture(scope="session")
+def project(project_file: dict) -> dict:
     """The `project` table of pyproject.toml."""
-    return tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    return project_file["project"]
 
 
 @pytest.fixture(scope="session")
@@ -56,14 +61,6 @@ def shared_data() -> Callable[[str], Path]:
         return path
 
     return path_of
-
-
-@pytest.fixture
-def free_port() -> int:
-    """A TCP port on loopback that nobody listened on a moment ago."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
 
 
 @pytest.fixture(scope="session")

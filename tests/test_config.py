@@ -123,7 +123,7 @@ def test_a_profile_sets_what_the_other_keys_start_from(write: Any) -> None:
         ({"atoms.admission.max_atoms": 1}, r"atoms\.admission is no setting any more"),
         ({"maps": []}, "at least one map"),
         ({"maps": ["a", "a"]}, "each once"),
-        ({"maps": ["srv"]}, "another name"),
+        ({"maps": ["srv"]}, "a map cannot be called 'srv'"),
         ({"maps": ["A b"]}, "is not an id"),
         ({"server_id": "*"}, "is not an id"),
         ({"intake.robots": ["r 1"]}, "is not an id"),

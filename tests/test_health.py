@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 
-from potserver.health import Health, rss_bytes
+from potserver.health import Health, Latency, rss_bytes
 
 
 def test_counters_start_at_zero_and_add_up() -> None:
@@ -30,23 +30,23 @@ def test_counting_from_many_threads_loses_nothing() -> None:
     for thread in threads:
         thread.join()
     assert health.counter("n") == 8000
-    assert health.latencies()["kind"].n == 10
+    assert health.latencies()["kind"].count == 10
 
 
 def test_percentiles_are_nearest_rank() -> None:
     health = Health()
     for ms in range(100, 0, -1):
         health.observe("integrate", float(ms))
-    assert health.latencies()["integrate"] == (100, 50.0, 95.0, 99.0, 100.0)
+    assert health.latencies()["integrate"] == Latency(100, 50.0, 95.0, 99.0, 100.0)
     health.observe("points", 7.5)
-    assert health.latencies()["points"] == (1, 7.5, 7.5, 7.5, 7.5)
+    assert health.latencies()["points"] == Latency(1, 7.5, 7.5, 7.5, 7.5)
 
 
 def test_only_the_last_window_counts() -> None:
     health = Health(window=4)
     for ms in (1000.0, 1.0, 2.0, 3.0, 4.0):
         health.observe("grid", ms)
-    assert health.latencies()["grid"] == (4, 2.0, 4.0, 4.0, 4.0)
+    assert health.latencies()["grid"] == Latency(4, 2.0, 4.0, 4.0, 4.0)
 
 
 def test_nothing_seen_is_nothing_said() -> None:

@@ -30,6 +30,25 @@ def numbers(value: ArrayLike, name: str, dtype: DTypeLike = np.float64) -> NDArr
         raise UsageError(f"{name}: not an array of numbers ({error})") from error
 
 
+def as_points(points: ArrayLike) -> Float64:
+    """(N, 3) float64; a third column of zeros is added to (N, 2), and one point of shape (3,) or (2,) becomes one row.
+
+    Raises:
+        UsageError: another shape, or coordinates that are not finite.
+    """
+    array = numbers(points, "points")
+    if array.ndim == 1 and array.shape[0] in (2, 3):
+        array = array[None, :]
+    if array.ndim != 2 or array.shape[1] not in (2, 3):
+        raise UsageError(f"points: shape {array.shape}, need (N, 3) or (N, 2)")
+    if not np.isfinite(array).all():
+        bad = int((~np.isfinite(array)).any(axis=1).sum())
+        raise UsageError(f"points: {bad} of {len(array)} have NaN or infinite coordinates")
+    if array.shape[1] == 2:
+        array = np.concatenate([array, np.zeros((len(array), 1))], axis=1)
+    return array
+
+
 def pose(value: ArrayLike, name: str = "T_map_sensor") -> Float64:
     """(4, 4) float64. Whether it is rigid is left to the server."""
     array = numbers(value, name)

@@ -10,12 +10,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from potclient.arrays import Float32
+from potclient.arguments import numbers
+from potclient.arrays import Float32, arrays_of
 from potclient.errors import BadReplyError, UsageError
+from potclient.files import whole
 from potclient.kernels import KernelSet
 from potschemas import messages
-from potschemas.messages import DType
-from potschemas.wire import WireError, decode, decode_array, encode, encode_array
+from potschemas.wire import WireError, decode, encode, encode_array
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -85,26 +86,18 @@ class Atom:
         Raises:
             BadReplyError: an array has the wrong dtype, shape or byte count.
         """
-        try:
-            hits, free = (
-                decode_array(getattr(message, name), name, dtypes=(DType.FLOAT32,), shape=(None, 3))
-                for name in ("hit_points", "free_points")
-            )
-        except WireError as error:
-            raise BadReplyError(f"atom {message.info.atom_id}: {error}") from error
+        what, shape = f"atom {message.info.atom_id}", (None, 3)
+        points = arrays_of(message, what, {"hit_points": shape, "free_points": shape})
         return Atom(
             info=message.info,
-            hit_points=hits.astype(np.float32),
-            free_points=free.astype(np.float32),
+            **{name: view.astype(np.float32) for name, view in points.items()},
             kernels=KernelSet.from_message(message.kernels),
         )
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write a `*.atom` file, which is the message `pot.atom.v1`, whole or not at all."""
-        target = Path(path)
-        partial = target.with_name(target.name + ".partial")
-        partial.write_bytes(encode(self.to_message()))
-        partial.replace(target)
+        with whole(path) as file:
+            file.write(encode(self.to_message()))
 
     @staticmethod
     def load(path: str | os.PathLike[str]) -> Atom:
@@ -124,10 +117,7 @@ class Atom:
 
 
 def _points(value: ArrayLike, name: str) -> Float32:
-    try:
-        points: Float32 = np.asarray(value, np.float32)
-    except (TypeError, ValueError) as error:
-        raise UsageError(f"{name}: not an array of numbers ({error})") from error
+    points = numbers(value, name, np.float32)
     if points.ndim != 2 or points.shape[1] != 3:
         raise UsageError(f"{name}: shape {points.shape}, need (N, 3)")
     return points

@@ -161,9 +161,9 @@ def export_npz(
         parts[part] = kernels
         if progress is not None:
             progress(len(parts), n_parts)
-    whole = KernelSet.concatenate(parts[i] for i in sorted(parts))
-    whole.save(path)
-    return Exported(len(whole), (whole.map_revision,))
+    joined = KernelSet.concatenate(parts[i] for i in sorted(parts))
+    joined.save(path)
+    return Exported(len(joined), (joined.map_revision,))
 
 
 def export_pgm(

@@ -245,9 +245,8 @@ class Feed:
                 self._unknown -= 1
             now = self._clock()
             receipt = Receipt(message, round_trip_s=now - sent.started)
-            if (
-                message.status is ReceiptStatus.DROPPED
-            ):  # an overloaded server answers at once: do not flood it
+            if message.status is ReceiptStatus.DROPPED:
+                # an overloaded server answers at once: do not flood it
                 first_s, longest_s = _BACKOFF_S
                 self._backoff_s = min(max(first_s, 2.0 * self._backoff_s), longest_s)
                 self._not_before = now + self._backoff_s
@@ -269,9 +268,8 @@ class Feed:
         while (cloud := self._next()) is not None:
             try:
                 self._put(cloud)
-            except (
-                Exception
-            ):  # the session is closed, or the cloud cannot be encoded: it certainly was not sent
+            except Exception:
+                # the session is closed, or the cloud cannot be encoded: it certainly was not sent
                 with self._changed:
                     if self._in_flight.pop(cloud.seq, None) is not None:
                         self._sent -= 1

@@ -12,14 +12,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from potclient.arrays import Bool, Float32, Float64, as_points
+from potclient.arguments import as_points
+from potclient.arrays import Bool, Float32, Float64, arrays_of
 from potclient.errors import BadReplyError, UsageError
 from potclient.files import save_npz
 from potclient.occupancy import Occupancy
 from potschemas import answers
 from potschemas.answers import RULE_FIELDS, AnswerRule, LatentGradients, LatentSums
-from potschemas.messages import Array, DType, Kernels
-from potschemas.wire import decode_array, encode_array
+from potschemas.messages import Kernels
+from potschemas.wire import encode_array
 
 _FILE_VERSION = 1
 _BLOCK_ELEMENTS = 2**20  # entries of one block of the (points, kernels) matrix: 8 MiB a temporary
@@ -45,8 +46,7 @@ class KernelSet:
 
     def __post_init__(self) -> None:
         k = len(self.hinge_mean)
-        for name, shape in _SHAPES.items():
-            expected = (k, 3) if shape == 2 else (k,)
+        for name, expected in _shapes(k).items():
             if getattr(self, name).shape != expected:
                 raise UsageError(f"{name}: shape {getattr(self, name).shape}, need {expected}")
 
@@ -65,7 +65,7 @@ class KernelSet:
 
     def take(self, index: NDArray[np.intp] | Bool | slice) -> KernelSet:
         """The kernels that a numpy index picks."""
-        arrays: dict[str, Any] = {name: getattr(self, name)[index] for name in _SHAPES}
+        arrays: dict[str, Any] = {name: getattr(self, name)[index] for name in _ARRAYS}
         return dataclasses.replace(self, **arrays)
 
     def occupancy(self, points: ArrayLike, *, gradient: bool = False) -> Occupancy:
@@ -130,7 +130,7 @@ class KernelSet:
             potclient_kernels=np.int64(_FILE_VERSION),
             map_revision=np.int64(self.map_revision),
             **{name: np.float64(value) for name, value in self.rule.fields().items()},
-            **{name: getattr(self, name) for name in _SHAPES},
+            **{name: getattr(self, name) for name in _ARRAYS},
         )
 
     @classmethod
@@ -155,7 +155,7 @@ class KernelSet:
                     map_revision=int(stored["map_revision"]),
                     **{
                         name: stored[name].astype(np.float64 if name == "hinge_mean" else np.float32)
-                        for name in _SHAPES
+                        for name in _ARRAYS
                     },
                 )
         except (OSError, EOFError, KeyError, ValueError, TypeError, zipfile.BadZipFile) as error:
@@ -164,16 +164,9 @@ class KernelSet:
     def to_message(self) -> Kernels:
         """The wire form; the origin is the middle of the hinges, so that float32 offsets keep their precision."""
         origin = np.round(self.hinge_mean.mean(axis=0)) if len(self) else np.zeros(3)
-        return Kernels(
-            origin=[float(v) for v in origin],
-            hinge_mean=encode_array((self.hinge_mean - origin).astype(np.float32)),
-            hinge_var=encode_array(self.hinge_var.astype(np.float32)),
-            gamma_shape=encode_array(self.gamma_shape.astype(np.float32)),
-            gamma_rate=encode_array(self.gamma_rate.astype(np.float32)),
-            weight_mean=encode_array(self.weight_mean.astype(np.float32)),
-            weight_var=encode_array(self.weight_var.astype(np.float32)),
-            **self.rule.fields(),
-        )
+        arrays = {name: getattr(self, name) for name in _ARRAYS} | {"hinge_mean": self.hinge_mean - origin}
+        fields: dict[str, Any] = {n: encode_array(array.astype(np.float32)) for n, array in arrays.items()}
+        return Kernels(origin=origin.tolist(), **fields | self.rule.fields())
 
     @classmethod
     def from_message(cls, message: Kernels, *, map_revision: int = 0) -> KernelSet:
@@ -182,25 +175,15 @@ class KernelSet:
         Raises:
             BadReplyError: an array has the wrong dtype, shape or byte count, or the rule a number that is negative.
         """
-
-        def array(name: str, wire: Array, shape: tuple[int | None, ...]) -> Float32:
-            return decode_array(wire, name, dtypes=(DType.FLOAT32,), shape=shape).astype(np.float32)
-
+        hinge = arrays_of(message, "kernels", {"hinge_mean": (None, 3)})["hinge_mean"]
+        views = arrays_of(message, "kernels", _shapes(len(hinge)))
+        arrays: dict[str, Any] = {name: view.astype(np.float32) for name, view in views.items()}
+        arrays["hinge_mean"] = hinge.astype(np.float64) + np.asarray(message.origin, np.float64)
         try:
-            hinge = array("hinge_mean", message.hinge_mean, (None, 3))
-            k = len(hinge)
-            return cls(
-                hinge_mean=hinge.astype(np.float64) + np.asarray(message.origin, np.float64),
-                hinge_var=array("hinge_var", message.hinge_var, (k, 3)),
-                gamma_shape=array("gamma_shape", message.gamma_shape, (k,)),
-                gamma_rate=array("gamma_rate", message.gamma_rate, (k,)),
-                weight_mean=array("weight_mean", message.weight_mean, (k,)),
-                weight_var=array("weight_var", message.weight_var, (k,)),
-                rule=AnswerRule.of(message),
-                map_revision=map_revision,
-            )
-        except ValueError as error:  # a WireError is one
+            rule = AnswerRule.of(message)
+        except ValueError as error:
             raise BadReplyError(f"kernels: {error}") from error
+        return cls(**arrays, rule=rule, map_revision=map_revision)
 
     @staticmethod
     def concatenate(sets: Iterable[KernelSet]) -> KernelSet:
@@ -215,18 +198,16 @@ class KernelSet:
         origins = list(dict.fromkeys((p.map_revision, p.rule) for p in parts))
         if len(origins) > 1:
             raise UsageError(f"kernel sets of different maps or revisions: {origins}")
-        arrays: dict[str, Any] = {name: np.concatenate([getattr(p, name) for p in parts]) for name in _SHAPES}
+        arrays: dict[str, Any] = {name: np.concatenate([getattr(p, name) for p in parts]) for name in _ARRAYS}
         return dataclasses.replace(parts[0], **arrays)
 
 
-_SHAPES = {
-    "hinge_mean": 2,
-    "hinge_var": 2,
-    "gamma_shape": 1,
-    "gamma_rate": 1,
-    "weight_mean": 1,
-    "weight_var": 1,
-}
+_ARRAYS = ("hinge_mean", "hinge_var", "gamma_shape", "gamma_rate", "weight_mean", "weight_var")
+
+
+def _shapes(k: int) -> dict[str, tuple[int, ...]]:
+    """Of the arrays of k kernels."""
+    return {name: (k, 3) if name.startswith("hinge") else (k,) for name in _ARRAYS}
 
 
 def _neighbourhoods(

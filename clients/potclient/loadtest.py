@@ -282,20 +282,18 @@ class _Crew:
 
 
 def _ask(client: MapClient, points: Any, tally: _Tally) -> None:
+    with tally.lock:
+        tally.asked += 1
     asked = time.monotonic()
     try:
         client.occupancy(points)
     except OverloadedError:
         with tally.lock:
-            tally.asked += 1
             tally.overloaded += 1
     except PotclientError as error:
-        with tally.lock:
-            tally.asked += 1
         tally.fail(error)
     else:
         with tally.lock:
-            tally.asked += 1
             tally.query_s.append(time.monotonic() - asked)
 
 

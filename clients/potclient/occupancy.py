@@ -26,9 +26,8 @@ class Occupancy:
     latent_mean: Float32  # (N,) log-odds
     latent_var: Float32  # (N,) log-odds^2
     observed: Bool  # (N,) false = no kernel near: unknown, which is not free
-    revisions: tuple[int, ...] = (
-        0,
-    )  # the map revisions that answered, ascending; several only for chunked requests
+    # the map revisions that answered, ascending; several only for chunked requests
+    revisions: tuple[int, ...] = (0,)
     gradient: Float32 | None = None  # (N, 3) 1/m, of `mean`; 0 where unobserved; none unless asked for
     latent_gradient: Float32 | None = None  # (N, 3) log-odds/m, of `latent_mean`; likewise
 

@@ -38,13 +38,7 @@ def draw_layer(
     Raises:
         UsageError: matplotlib is missing, or the level lies outside the grid.
     """
-    try:
-        import matplotlib
-    except ImportError as error:
-        raise UsageError("pictures need the package matplotlib: pip install matplotlib") from error
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-
+    pyplot = load_pyplot()
     layer, z = _layer_at(grid, level_m)
     nx, ny, _ = grid.shape
     x, y = float(grid.lower[0]), float(grid.lower[1])
@@ -80,6 +74,22 @@ def draw_layer(
     figure.suptitle(f"{head}z = {z:.2f} m, revision {grid.revision}, grey = unknown")
     figure.savefig(path, dpi=110)
     pyplot.close(figure)
+
+
+def load_pyplot() -> Any:
+    """matplotlib's pyplot, for pictures that go to files.
+
+    Raises:
+        UsageError: matplotlib is missing.
+    """
+    try:
+        import matplotlib
+    except ImportError as error:
+        raise UsageError("pictures need the package matplotlib: pip install matplotlib") from error
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    return pyplot
 
 
 def _layer_at(grid: Grid, level_m: float | None) -> tuple[int, float]:

@@ -16,9 +16,8 @@ class Receipt:
 
     def __init__(self, message: messages.Receipt, *, round_trip_s: float | None = None) -> None:
         self.message = message
-        self.round_trip_s = (
-            round_trip_s  # from the moment the cloud was given to Zenoh; None if it is not known
-        )
+        # from the moment the cloud was given to Zenoh; None if it is not known
+        self.round_trip_s = round_trip_s
 
     def __repr__(self) -> str:
         m = self.message

@@ -1,1 +1,1 @@
-
+"""What touches Zenoh: clouds and questions in, receipts, answers and counters out."""

@@ -24,9 +24,8 @@ from potserver.log import get_logger
 log = get_logger("potserver.poses")
 
 POSES_PER_ROBOT = 1024  # kept: 20 s at 50 Hz
-WAIT_S = (
-    0.2  # for the stream to reach a cloud's stamp: a few of its periods. The writer stands still that long
-)
+# for the stream to reach a cloud's stamp: a few of its periods. The writer stands still that long
+WAIT_S = 0.2
 _CHANNEL = 256  # a burst beyond this loses its oldest poses; interpolation bridges the hole
 
 

@@ -62,12 +62,12 @@ class RobotWatch:
     def _note(self, robot_id: str, sample: zenoh.Sample) -> None:
         with self._lock:
             if sample.kind == zenoh.SampleKind.DELETE:
-                known = robot_id in self._alive
+                is_news = robot_id in self._alive
                 self._alive.discard(robot_id)
             else:
-                known = robot_id not in self._alive and len(self._alive) < self._max_robots
-                if known:
+                is_news = robot_id not in self._alive and len(self._alive) < self._max_robots
+                if is_news:
                     self._alive.add(robot_id)
-        if known:
+        if is_news:
             event = "robot_left" if sample.kind == zenoh.SampleKind.DELETE else "robot_joined"
             log.info(event, map_id=self._map_id, robot_id=robot_id)

@@ -6,7 +6,6 @@ or the map's writer answer. Replies take the quality of service of their query, 
 
 from __future__ import annotations
 
-import contextlib
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
@@ -15,18 +14,17 @@ from typing import Any
 import numpy as np
 import zenoh
 
-from potschemas import keys, messages
+from potschemas import keys
 from potserver.adapters.key_exprs import last_chunk
 from potserver.adapters.query_pool import QueryJob, QueryPool
 from potserver.adapters.questions.question import Asked, Question, Served
-from potserver.codec.base import Wire, check_encoding, check_size, decode, encode, encode_error
+from potserver.adapters.replies import BUG, INTEGRATE, check_query, payload_of, reply, reply_error
+from potserver.codec.base import decode, encode
 from potserver.errors import DeadlineError, PotserverError, ShuttingDownError, UnsupportedError
 from potserver.log import get_logger
 
 log = get_logger("potserver.queries")
 
-INTEGRATE = "integrate"
-BUG = "a bug of the server; the traceback is in its log"
 _BACKLOG = 64  # queries between Zenoh and our admission; admission takes microseconds
 
 
@@ -66,35 +64,6 @@ class Queryable(ABC):
     @abstractmethod
     def refuse(self, query: zenoh.Query, error: PotserverError) -> None:
         """End a query with an error; from any thread."""
-
-
-def check_query(query: zenoh.Query, kind: type[messages.Message], max_bytes: int, what: str) -> int:
-    """Refuse a query by its size and its encoding, before its bytes are touched; the size, bytes.
-
-    Raises:
-        TooLargeError, BadMessageError.
-    """
-    n_bytes = 0 if query.payload is None else len(query.payload)
-    check_size(n_bytes, max_bytes, what)
-    check_encoding(None if query.encoding is None else str(query.encoding), kind)
-    return n_bytes
-
-
-def payload_of(query: zenoh.Query) -> bytes:
-    """Its bytes; none are an empty payload."""
-    return b"" if query.payload is None else query.payload.to_bytes()
-
-
-def reply(query: zenoh.Query, key: str, wire: Wire) -> None:
-    """Send one reply, on our own key: the query's may be wild."""
-    query.reply(key, wire.payload, encoding=wire.encoding)
-
-
-def reply_error(query: zenoh.Query, error: PotserverError) -> None:
-    """Send what went wrong."""
-    wire = encode_error(error)
-    with contextlib.suppress(zenoh.ZError):  # the asker may be gone
-        query.reply_err(wire.payload, encoding=wire.encoding)
 
 
 class MapQueryable(Queryable):

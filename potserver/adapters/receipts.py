@@ -7,7 +7,6 @@ transfer. When the bulk outbox is full, parameters are dropped and counted (`par
 
 from __future__ import annotations
 
-import contextlib
 import math
 import time
 from collections.abc import Callable
@@ -19,7 +18,8 @@ from potschemas import messages
 from potschemas.keys import MapKeys
 from potserver.adapters.intake import CloudJob, IntakeQueue
 from potserver.adapters.outbox import End, Outbox
-from potserver.codec.base import Wire, encode, encode_error
+from potserver.adapters.replies import INTEGRATE, reply, reply_error
+from potserver.codec.base import Wire, encode
 from potserver.codec.clouds import UNKNOWN_SEQ, decode_cloud_head
 from potserver.codec.kernels import encode_kernels
 from potserver.domain.map_state import MapState
@@ -69,15 +69,6 @@ class ReceiptSender:
         """The cloud is in the map."""
         self._health.count("clouds.accepted")
         map_id, waited = self._keys.map_id, Waited(self._intake.depth, wait_ms)
-
-        def publish_params() -> None:
-            self._put(
-                self._keys.params(scan.robot_id),
-                encode_params(map_id, scan, update),
-                zenoh.Priority.DATA,
-            )
-            self._health.count("params.sent")
-
         if job.query is not None:
             query = job.query
             self._bulk.post_now(
@@ -95,7 +86,7 @@ class ReceiptSender:
                 ),
                 ended=self._count_receipt,
             )
-            if not self._bulk.offer(publish_params):
+            if not self._bulk.offer(lambda: self._publish_params(scan, update)):
                 self._health.count("params.dropped")
         self.tick(update.map_revision, update.map_kernels, update.changed)
 
@@ -151,13 +142,17 @@ class ReceiptSender:
         else:
             self._prompt.post_now(send, n_bytes, ended=self._count_receipt)
 
+    def _publish_params(self, scan: Scan, update: MapUpdate) -> None:
+        wire = encode_params(self._keys.map_id, scan, update)
+        self._put(self._keys.params(scan.robot_id), wire, zenoh.Priority.DATA)
+        self._health.count("params.sent")
+
     def _refuse_query(self, query: zenoh.Query, error: PotserverError) -> None:
         """Knows nothing of the cloud, whose bytes can go at once."""
 
         def send() -> None:
-            with query, contextlib.suppress(zenoh.ZError):  # the asker may be gone
-                wire = encode_error(error)
-                query.reply_err(wire.payload, encoding=wire.encoding)
+            with query:
+                reply_error(query, error)
 
         self._prompt.post_now(send, ended=self._count_receipt)
 
@@ -183,7 +178,7 @@ class ReceiptSender:
 
     def _reply(self, query: zenoh.Query, wire: Wire) -> None:
         with query:
-            query.reply(self._keys.query("integrate"), wire.payload, encoding=wire.encoding)
+            reply(query, self._keys.query(INTEGRATE), wire)
             self._health.count("queries.integrate.ok")
 
 

@@ -1,6 +1,7 @@
 """Our Zenoh node: a peer with one loopback listener and no multicast, unless told otherwise.
 
-What is built in yields to the Zenoh configuration file, that to `--cfg KEY:VALUE`, and that to the flags `-m -e -l`.
+Four sources make the configuration, and later ones win: built-in values, the Zenoh configuration file, `--cfg KEY:VALUE`, and
+the flags `-m -e -l`.
 """
 
 from __future__ import annotations

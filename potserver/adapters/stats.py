@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import threading
 import time
 from collections.abc import Callable, Mapping
@@ -9,7 +10,8 @@ from collections.abc import Callable, Mapping
 import zenoh
 
 from potschemas import messages
-from potserver.adapters.queryable import Queryable, check_query, payload_of, reply, reply_error
+from potserver.adapters.queryable import Queryable
+from potserver.adapters.replies import check_query, payload_of, reply, reply_error
 from potserver.codec.base import Wire, decode, encode
 from potserver.domain.map_state import MapState
 from potserver.errors import PotserverError
@@ -109,14 +111,8 @@ def encode_stats(
             counters=health.counters() | {"robots.alive": n_robots},
             queues=queues,
             latencies={
-                kind: messages.LatencySummary(
-                    count=summary.n,
-                    p50_ms=summary.p50_ms,
-                    p95_ms=summary.p95_ms,
-                    p99_ms=summary.p99_ms,
-                    max_ms=summary.max_ms,
-                )
-                for kind, summary in health.latencies().items()
+                kind: messages.LatencySummary(**dataclasses.asdict(latency))
+                for kind, latency in health.latencies().items()
             },
             rss_bytes=rss_bytes(),
             map_kernels={map_id: len(held.snapshot) for map_id, held in maps.items()},

@@ -7,6 +7,7 @@ import time
 from potserver.adapters.clouds import CloudReader
 from potserver.adapters.intake import CloudJob, IntakeQueue
 from potserver.adapters.receipts import ReceiptSender
+from potserver.adapters.replies import BUG
 from potserver.adapters.stamps import StampOrder
 from potserver.domain.map_state import MapState
 from potserver.domain.types import Float64, TileChange
@@ -141,7 +142,7 @@ class MapWriter:
             return
         except Exception:
             log.exception("scan_failed", map_id=self._map_id, robot_id=job.robot_id)
-            self._receipts.refuse(job, PotserverError("a bug of the server; the traceback is in its log"))
+            self._receipts.refuse(job, PotserverError(BUG))
             return
         integrate_ms = (time.perf_counter() - started_s) * 1e3
         self._stamps.remember(scan.robot_id, scan.stamp_ns)

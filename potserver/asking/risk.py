@@ -37,9 +37,8 @@ class Risk:
     spheres: ArrayLike  # (S, 4) m: centre in the body frame, and radius
     unknown: Unknown = Unknown.OCCUPIED  # what unobserved cells are taken for
     resolution_m: float | None = None  # edge of a cell; None = half the smallest radius
-    correlation_m: float | None = (
-        None  # edge of a cube that is one trial; None = the kernels' own width there
-    )
+    # edge of a cube that is one trial; None = the kernels' own width there
+    correlation_m: float | None = None
     dims: int = 3  # 2 takes the spheres for discs in the plane z = 0, for planar maps
 
     def plan(self, snapshot: KernelMap, limits: Limits, *, part_cells: int = PART_CELLS) -> RiskPlan:

@@ -16,8 +16,7 @@ from potserver.domain.tiles import Tile, TileIndex
 from potserver.domain.types import Float32, KernelSet
 from potserver.errors import BadPointsError, ShapeError, TooLargeError
 from potserver.limits import Limits
-
-Int64 = NDArray[np.int64]
+from potserver.numerics.arrays import Int64
 
 MANTISSA_BITS = 23  # of a float32
 _LEAST_BITS = 2
@@ -43,9 +42,8 @@ class Tiles:
     known: KnownTiles | None = None  # what the asker has; None = nothing
     lower: ArrayLike | None = None  # (3,) m, map frame; None = no bound on that side
     upper: ArrayLike | None = None  # (3,) m, map frame; likewise
-    mantissa_bits: int = (
-        MANTISSA_BITS  # of each weight's mean and variance, 2 to 23; fewer than 23 are rounded to
-    )
+    # of each weight's mean and variance, 2 to 23; fewer than 23 are rounded to
+    mantissa_bits: int = MANTISSA_BITS
 
     def plan(
         self, state: MapState, limits: Limits, *, tile_size_m: float, part_kernels: int = PART_KERNELS

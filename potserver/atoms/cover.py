@@ -149,9 +149,10 @@ def _turns(atom: Atom) -> list[Atom]:
 
 def _profile(atom: Atom) -> Float64:
     """(96,) m: quantiles of both point sets along each axis, so scaled that squared distances bound those of the atoms."""
-    centre = (atom.hit_points if len(atom.hit_points) else atom.free_points).mean(axis=0, dtype=np.float64)
     parts = [
-        np.quantile(points - centre, _QUANTILES, axis=0) if len(points) else np.zeros((len(_QUANTILES), 3))
+        np.quantile(points - atom.centre, _QUANTILES, axis=0)
+        if len(points)
+        else np.zeros((len(_QUANTILES), 3))
         for points in (atom.hit_points, atom.free_points)
     ]
     return np.concatenate(parts).ravel() / np.sqrt(len(_QUANTILES))

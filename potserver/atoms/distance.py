@@ -44,7 +44,7 @@ def near_in_spread(atom: Atom, other: Atom, limit_m2: float) -> bool:
     projections is at least the squared difference of the means plus that of the standard deviations.
     """
     bound = 0.0
-    centre, other_centre = _centre(atom), _centre(other)
+    centre, other_centre = atom.centre, other.centre
     for points, others in ((atom.hit_points, other.hit_points), (atom.free_points, other.free_points)):
         if len(points) and len(others):
             shift = (points.mean(axis=0) - centre) - (others.mean(axis=0) - other_centre)
@@ -86,8 +86,4 @@ def _thinned(atom: Atom, points: Float32, count: int) -> Float32:
     if len(points) == 0:
         return points
     picked = thin(points, count, _VOXEL_M, np.random.default_rng(0))
-    return (points[picked] - _centre(atom)).astype(np.float32)
-
-
-def _centre(atom: Atom) -> Float64:
-    return (atom.hit_points if len(atom.hit_points) else atom.free_points).mean(axis=0, dtype=np.float64)
+    return (points[picked] - atom.centre).astype(np.float32)

@@ -165,7 +165,7 @@ def learn_atoms(
                 dims=2 if window[0].is_planar else 3,
                 hit_points=_keep(local[labels], settings.max_points, rng),
                 free_points=_keep(local[~labels], settings.max_points, rng),
-                kernels=_kernel_set(learned),
+                kernels=KernelSet.of(learned),
                 radius_m=settings.max_range_m,
                 azimuth_width_rad=width_rad,
                 provenance=provenance
@@ -244,17 +244,6 @@ def lattice(points: Float64, n_kernels: int) -> tuple[Float64, Float64]:
     hinge = lower + (np.floor((points[picked] - lower) / coarse) + 0.5) * coarse
     hinge[:, flat] = points[0, flat]
     return hinge, np.full(len(hinge), 0.5 / (_LENGTH_IN_SPACINGS * coarse) ** 2)
-
-
-def _kernel_set(learned: AbhmPosterior) -> KernelSet:
-    return KernelSet(
-        hinge_mean=learned.hinge_mean,
-        hinge_var=learned.hinge_var,
-        gamma_shape=learned.gamma_shape,
-        gamma_rate=learned.gamma_rate,
-        weight_mean=learned.weight_mean,
-        weight_var=learned.weight_var,
-    )
 
 
 def _keep(points: Float64, n: int, rng: np.random.Generator) -> Float32:

@@ -12,14 +12,13 @@ from numpy.typing import NDArray
 
 from potschemas import messages, wire
 from potschemas.messages import DType, ErrorCode
-from potserver.errors import BadMessageError, PotserverError, TooLargeError, error_classes
+from potserver.errors import PotserverError, TooLargeError, error_classes
 
 MessageT = TypeVar("MessageT", bound=messages.Message)
 Shape = tuple[int | tuple[int, ...] | None, ...]  # an axis: its length, the accepted lengths, or any
 
 MAX_SMALL_BYTES = 4096  # of messages without arrays
 FLOATS = (DType.FLOAT32, DType.FLOAT64)
-_UNSET_ENCODING = "zenoh/bytes"  # what Zenoh reports when the sender named none
 _ERRORS = error_classes()
 
 
@@ -41,14 +40,13 @@ def check_size(n_bytes: int, limit: int, what: str) -> None:
 
 
 def check_encoding(encoding: str | None, kind: type[messages.Message]) -> None:
-    """Refuse a payload that says it is something else; a sender that says nothing is taken at its word.
+    """Refuse a payload that says it is something else; what says nothing passes, see `potschemas.wire.check_encoding`.
 
     Raises:
-        BadMessageError: the encoding names another schema.
+        BadMessageError: the encoding names another schema, or another format.
     """
-    expected = wire.encoding_of(kind)
-    if encoding not in (None, "", _UNSET_ENCODING, expected):
-        raise BadMessageError(f"the encoding is {encoding[:80]!r}, need {expected!r}")
+    with typed_errors():
+        wire.check_encoding(encoding or "", kind)
 
 
 def decode(payload: bytes, kind: type[MessageT], max_bytes: int = MAX_SMALL_BYTES) -> MessageT:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,7 +11,7 @@ from numpy.typing import NDArray
 from potschemas import messages
 from potschemas.answers import AnswerRule
 from potschemas.wire import pack_array
-from potserver.codec.base import float32
+from potserver.codec.base import float32_fields
 from potserver.domain.types import Float32, Float64, KernelSet
 
 _BYTES_OF_SHAPE = 5 * 4  # hinge_var, gamma_shape, gamma_rate
@@ -22,16 +23,8 @@ _LEAST_ON_LATTICE = 4  # kernels: of fewer, the hinges themselves are shorter th
 def encode_kernels(kernels: KernelSet, rule: AnswerRule) -> messages.Kernels:
     """Kernels as they are: float64 hinges become float32 offsets from their centroid, in whole metres."""
     origin = np.round(kernels.hinge_mean.mean(axis=0)) if len(kernels) else np.zeros(3)
-    return messages.Kernels(
-        origin=[float(c) for c in origin],
-        hinge_mean=float32(kernels.hinge_mean - origin),
-        hinge_var=float32(kernels.hinge_var),
-        gamma_shape=float32(kernels.gamma_shape),
-        gamma_rate=float32(kernels.gamma_rate),
-        weight_mean=float32(kernels.weight_mean),
-        weight_var=float32(kernels.weight_var),
-        **rule.fields(),
-    )
+    fields: dict[str, Any] = {**float32_fields(kernels.moved(-origin)), **rule.fields()}
+    return messages.Kernels(origin=origin.tolist(), **fields)
 
 
 def code_kernels(kernels: KernelSet, spacings_m: Sequence[float]) -> messages.CodedKernels:

@@ -143,6 +143,7 @@ def _header(atom: Atom) -> str:
 
 
 def views_of(atom: Atom) -> list[_View]:
+    """From above, and of an atom in 3D from the side too."""
     planes = [(2, 0, 1)] if atom.dims == 2 else [(2, 0, 1), (1, 0, 2)]
     return [_view(atom, *plane) for plane in planes]
 
@@ -229,9 +230,8 @@ def _draw_row(
     points, by_gamma, by_weight, mean, std = panels
     _draw_points(points, atom.free_points, view, _FREE)
     _draw_points(points, atom.hit_points, view, _HIT)
-    kernels = atom.kernels.take(
-        np.argsort(atom.kernels.gamma, kind="stable")
-    )  # narrow ones on top of wide ones
+    # narrow ones on top of wide ones
+    kernels = atom.kernels.take(np.argsort(atom.kernels.gamma, kind="stable"))
     _draw_kernels(by_gamma, kernels, kernels.gamma, view, "gamma", palette.gamma)
     _draw_kernels(by_weight, kernels, kernels.weight_mean, view, "weight", palette.weight)
     _draw_prediction(mean, std, atom, view, palette)

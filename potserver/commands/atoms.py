@@ -7,6 +7,8 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import msgspec
+
 from potserver.commands import atoms_build
 from potserver.commands.shared import (
     EXIT_OK,
@@ -96,16 +98,12 @@ def _info(options: argparse.Namespace) -> int:
 
 
 def _record(atom: Atom) -> dict[str, Any]:
-    return {
-        "atom_id": atom.atom_id,
-        "dims": atom.dims,
-        "n_hits": len(atom.hit_points),
-        "n_free": len(atom.free_points),
-        "n_kernels": len(atom.kernels),
-        "radius_m": atom.radius_m,
-        "azimuth_width_rad": atom.azimuth_width_rad,
-        "provenance": dict(atom.provenance),
-    }
+    """What a server would say of it, but for how often it has served."""
+    from potserver.codec.atoms import encode_atom_info
+
+    record = msgspec.structs.asdict(encode_atom_info(atom, {}))
+    del record["times_used"]
+    return record
 
 
 def _cells(atom: Atom) -> list[str]:

@@ -13,8 +13,17 @@ from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Any
 
-from potserver.commands.shared import EXIT_FORCED, EXIT_OK, add_verb, results_console, say, table
+from potserver.commands.shared import (
+    EXIT_FORCED,
+    EXIT_OK,
+    add_verb,
+    check_writable,
+    results_console,
+    say,
+    table,
+)
 from potserver.errors import DictionaryError
+from potserver.toml import toml_value
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -96,16 +105,14 @@ def _build(options: argparse.Namespace) -> Built:
     """Learn, choose, save.
 
     Raises:
-        DictionaryError: nothing to learn from, nothing learned, or nowhere to write.
-        SettingsError: the recipe is wrong.
+        DictionaryError: nothing to learn from, or nothing learned.
+        SettingsError: the recipe is wrong, or there is nowhere to write.
         KeyboardInterrupt: at Ctrl-C or SIGTERM; nothing is written then.
     """
     from potserver.atoms.build.builder import build, scan_tasks
 
     recipe, folder = recipe_of(options)
-    out = Path(options.out)
-    if not out.absolute().parent.is_dir():  # asked before the work, not after it
-        raise DictionaryError(f"cannot write {out}: no folder {out.absolute().parent}")
+    check_writable(options.out)
     workers = _workers(options)
     console = results_console()
     started = time.monotonic()
@@ -129,7 +136,7 @@ def _build(options: argparse.Namespace) -> Built:
             on_epoch=shown.epoch if options.watch else None,
             on_chosen=shown.chosen,
         )
-    built.dictionary.save(out)
+    built.dictionary.save(options.out)
     _print_summary(built, console)
     console.print(f"{time.monotonic() - started:.0f} s")
     return built
@@ -181,12 +188,10 @@ def recipe_of(options: argparse.Namespace) -> tuple[Recipe, Path]:
 
 def _assignment(text: str) -> tuple[str, Any]:
     """KEY=VALUE with the value as in TOML."""
-    from potserver.atoms.build.recipe import tomllib
-
     key, _, value = text.partition("=")
     try:
-        return key, tomllib.loads(f"value = {value}")["value"]
-    except tomllib.TOMLDecodeError as error:
+        return key, toml_value(value)
+    except ValueError as error:
         raise DictionaryError(f"--learner {text!r}: need KEY=VALUE, the value as in TOML") from error
 
 

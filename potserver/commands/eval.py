@@ -52,7 +52,7 @@ examples:
   potserver eval /data/kitti/00 --scans 20 --max-range 25
   potserver eval /data/kitti/00 --scans 20 --max-range 25 --peers octomap:0.1,octomap:0.2,bgk:0.2,grid
   potserver eval town:terraces:dynamic:7 --scans 25 --max-range 25 --ablations --json out/town.json
-  potserver eval town:suburb:7 --profile paper --set mapping.n_sectors=8
+  potserver eval town:suburb:7 --profile paper --set mapping.max_range_m=15
   potserver eval bundled:rooms --peers grid"""
 
 _HELD_OUT = (

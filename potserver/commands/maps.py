@@ -8,8 +8,6 @@ import functools
 import json
 import re
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -18,7 +16,15 @@ from numpy.typing import NDArray
 
 from potclient.commands import export_flags, pose_flag
 from potclient.octomap import DEPTH, KEY_ORIGIN, Leaves, read_bt
-from potserver.commands.shared import EXIT_OK, add_group, add_settings_flags, add_verb, say, settings_of
+from potserver.commands.shared import (
+    EXIT_OK,
+    add_group,
+    add_settings_flags,
+    add_verb,
+    file_errors,
+    say,
+    settings_of,
+)
 from potserver.errors import MapFileError, SettingsError
 
 if TYPE_CHECKING:
@@ -49,7 +55,7 @@ Make a *.map file. In the folder `saved` of a server's store, `potclient map loa
   *.bt        a binary OctoMap: its voxels become evidence of a robot named after the file, and kernels are solved
               on it
   *.npz       kernels, as `potclient export npz` writes them. There is no evidence with them, so only servers of profile
-              `paper` load them; they answer by their own mapping.mean_moderation and mapping.residual_var
+              `paper` load them, and answer by that profile's rule
   DIR, *.map  the last snapshot of a map's folder, or a saved map, written anew"""
 
 _IMPORT_EXAMPLES = """\
@@ -73,9 +79,8 @@ _ONE_MAP = "a *.map file, or a map's folder in a store"
 # misses as free, ln(.881 / .119) / ln(.6 / .4). A binary file says only on which side of 0.5 a voxel is.
 _OCCUPIED_LOOKS = 4.1
 _FREE_LOOKS = 4.9
-# A scan spreads a beam's free evidence, one look in all, over its whole way: a voxel of free space gets a part of it. Chosen on
-# two OctoMaps, of rooms and of an office: 99 % of the occupied space and 96 and 89 % of the free come back as they were. With
-# 1/10 it was 100, 94 and 85 %, with 1 it was 97, 97 and 92 %.
+# A scan spreads a beam's free evidence, one look in all, over its whole way: a voxel of free space gets a part of it. With this
+# share an OctoMap of rooms or of an office comes back with 99 % of its occupied space, and with 96 or 89 % of its free space.
 _FREE_SHARE = 1.0 / 3.0
 _FINEST_M = 0.2
 _MAX_PLACES = 20_000_000
@@ -256,7 +261,7 @@ def _from_saved(file: Path) -> tuple[MapState, Origin]:
 def _from_octomap(path: Path, looks: float, settings: Settings) -> MapState:
     from potserver.mapping.imports import state_of_places
 
-    with _read_errors(path):
+    with file_errors(f"read {path}"):
         leaves, resolution = read_bt(path)
     fine_m = settings.mapping.resolution_m or max(resolution, _FINEST_M)
     places = places_of(leaves, resolution, fine_m, looks)
@@ -316,13 +321,12 @@ def _from_kernels(path: Path, settings: Settings) -> MapState:
     from potserver.mapping.imports import state_of_kernels
     from potserver.mapping.paper import PAPER, PotPipeline
 
-    with _read_errors(path):
+    with file_errors(f"read {path}"):
         kernels = ClientKernels.load(path)
     service = _service(
         settings.mapping, settings, functools.partial(PotPipeline, method=PAPER._replace(rule=kernels.rule))
     )
-    arrays = {f.name: getattr(kernels, f.name) for f in dataclasses.fields(KernelSet)}
-    return state_of_kernels(service, KernelSet(**arrays))
+    return state_of_kernels(service, KernelSet.of(kernels))
 
 
 def _service(
@@ -335,14 +339,6 @@ def _service(
     return MappingService(
         AtomDictionary(()), mapping, threads=settings.threads, make_pipeline=make_pipeline or pipeline_of
     )
-
-
-@contextmanager
-def _read_errors(path: Path) -> Iterator[None]:
-    try:
-        yield
-    except OSError as error:
-        raise MapFileError(f"cannot read {path}: {error.strerror or error}", reason="missing") from error
 
 
 # --- merge ------------------------------------------------------------------------------------------------------------

@@ -13,7 +13,6 @@ read. Positions of kernels are float32 here, exact to 1 um in a sector, and wide
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import hashlib
 import itertools
 import json
@@ -30,18 +29,17 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save as to_safetensors
 
 from potserver.domain.folders import sync_folder
-from potserver.domain.types import Atom, KernelSet
+from potserver.domain.types import KERNEL_ARRAYS, Atom, KernelSet
 from potserver.errors import BadPointsError, DictionaryError, EmptyError, ShapeError
 
 VERSION = 2
 _METADATA_KEY = "potserver-atoms"  # one key: safetensors keeps no order between several
 _DIGEST = "sha256"  # the only array of bytes, and safetensors puts those last
 _DIGEST_BYTES = hashlib.sha256().digest_size
-_KERNEL_ARRAYS = tuple(f.name for f in dataclasses.fields(KernelSet))
 _COLUMNS = {  # array -> numbers a row, its offsets
     "hit_points": (3, "hit_offsets"),
     "free_points": (3, "free_offsets"),
-    **{name: (3 if name.startswith("hinge") else 0, "kernel_offsets") for name in _KERNEL_ARRAYS},
+    **{name: (3 if name.startswith("hinge") else 0, "kernel_offsets") for name in KERNEL_ARRAYS},
 }
 _OFFSETS = ("hit_offsets", "free_offsets", "kernel_offsets")
 _DTYPES: dict[str, np.dtype[Any]] = {"I64": np.dtype("<i8"), "F32": np.dtype("<f4"), "U8": np.dtype("u1")}
@@ -81,7 +79,7 @@ class AtomFile:
                 **record._asdict(),
                 hit_points=rows["hit_points"],
                 free_points=rows["free_points"],
-                kernels=KernelSet(**{name: rows[name] for name in _KERNEL_ARRAYS}),
+                kernels=KernelSet(**{name: rows[name] for name in KERNEL_ARRAYS}),
             )
         except (ShapeError, BadPointsError, EmptyError) as error:
             raise DictionaryError(f"{self.path}: atom {record.atom_id!r}: {error}") from error
@@ -124,9 +122,8 @@ def open_atoms(path: Path, *, verify: bool = True) -> AtomFile:
                     f"{path} is an atom dictionary of version 1 (.npz) or a zip file; this program reads version {VERSION}:"
                     " build it again with `potserver atoms build`"
                 )
-            with safe_open(
-                path, framework="numpy"
-            ) as container:  # checks that the header describes the whole file
+            # opening checks that the header describes the whole file
+            with safe_open(path, framework="numpy") as container:
                 metadata = container.metadata() or {}
                 described = [
                     (name, (part := container.get_slice(name)).get_dtype(), tuple(part.get_shape()))
@@ -155,7 +152,7 @@ def _image(atoms: Sequence[Atom]) -> bytes:
         _DIGEST: np.zeros(_DIGEST_BYTES, np.uint8),
     }
     for name, (width, _) in _COLUMNS.items():
-        parts = [getattr(atom.kernels if name in _KERNEL_ARRAYS else atom, name) for atom in atoms]
+        parts = [getattr(atom.kernels if name in KERNEL_ARRAYS else atom, name) for atom in atoms]
         empty = np.zeros((0, width) if width else 0, np.float32)
         arrays[name] = np.ascontiguousarray(np.concatenate([empty, *parts]), np.dtype("<f4"))
     records = [

@@ -24,9 +24,8 @@ class RunningScores:
     n_points: float = 0.0
     nll: Float64 = dataclasses.field(default_factory=lambda: np.zeros(len(MODERATIONS)))  # (M,) nats, sum
     brier: float = 0.0  # sum
-    bins: Float64 = dataclasses.field(
-        default_factory=lambda: np.zeros((scores.N_BINS, 3))
-    )  # n, sum of p, sum of y
+    # (N_BINS, 3) n, sum of p, sum of y
+    bins: Float64 = dataclasses.field(default_factory=lambda: np.zeros((scores.N_BINS, 3)))
 
     def with_points(
         self, latent_mean: Float32, latent_var: Float32, occupied: Bool, moderation: float

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from enum import Enum
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -140,7 +140,7 @@ class KernelSet:
 
     def take(self, index: NDArray[np.intp] | Bool | slice) -> KernelSet:
         """The kernels that a numpy index picks."""
-        return KernelSet._checked({name: getattr(self, name)[index] for name in _KERNEL_ARRAYS})
+        return KernelSet._checked({name: getattr(self, name)[index] for name in KERNEL_ARRAYS})
 
     def replace(self, **arrays: NDArray[np.floating]) -> KernelSet:
         """A copy with some arrays exchanged."""
@@ -156,7 +156,7 @@ class KernelSet:
         if not sets:
             return KernelSet.empty()
         return KernelSet._checked(
-            {name: np.concatenate([getattr(s, name) for s in sets]) for name in _KERNEL_ARRAYS}
+            {name: np.concatenate([getattr(s, name) for s in sets]) for name in KERNEL_ARRAYS}
         )
 
     @staticmethod
@@ -167,6 +167,15 @@ class KernelSet:
             array.flags.writeable = False
             object.__setattr__(new, name, array)
         return new
+
+    @staticmethod
+    def of(record: Any) -> KernelSet:
+        """The kernels of a record that has arrays of the same names.
+
+        Raises:
+            ShapeError: as on construction.
+        """
+        return KernelSet(**{name: getattr(record, name) for name in KERNEL_ARRAYS})
 
     @staticmethod
     def empty() -> KernelSet:
@@ -182,7 +191,7 @@ class KernelSet:
         )
 
 
-_KERNEL_ARRAYS = tuple(field.name for field in dataclasses.fields(KernelSet))
+KERNEL_ARRAYS = tuple(field.name for field in dataclasses.fields(KernelSet))  # by name
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -209,6 +218,12 @@ class Atom:
             raise EmptyError(f"atom {self.atom_id} has no points: nothing could be matched to it")
         if self.dims not in (2, 3):
             raise ShapeError(f"atom {self.atom_id}: {self.dims} dimensions, need 2 or 3")
+
+    @property
+    def centre(self) -> Float64:
+        """(3,) m: the mean of its hits, or of its free points where it has no hits."""
+        points = self.hit_points if len(self.hit_points) else self.free_points
+        return points.mean(axis=0, dtype=np.float64)
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -278,9 +293,8 @@ class MapUpdate:
     sectors: list[SectorMatch]
     n_points: int  # beams used
     n_kernels_added: int  # that the overall map took, of both kinds
-    n_kernels_transported: (
-        int  # of those, carried from atoms; the others were placed where nothing explained the data
-    )
+    # of those, carried from atoms; the others were placed where nothing explained the data
+    n_kernels_transported: int
     map_kernels: int
     converged: bool  # neither joint solve got stuck; if one did, its weights are the best found
     rule: AnswerRule  # what turns `kernels` into answers

@@ -46,9 +46,8 @@ def state_of_places(
             points[members] - region.origin_m, occupied[members].astype(np.uint8), weight[members]
         )
         add_evidence(region, samples, number)
-        tiled = tiled._replace(
-            tiles={**tiled.tiles, **region.tiles(centre, centre)}
-        )  # without kernels: nothing to index
+        # without kernels: nothing to index
+        tiled = tiled._replace(tiles={**tiled.tiles, **region.tiles(centre, centre)})
     evidence_only = MapState(snapshot=KernelMap(KernelSet.empty()), tiled=tiled)
     service.merge(evidence_only, np.eye(4))
     return service.state

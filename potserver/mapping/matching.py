@@ -18,9 +18,8 @@ class RankScore(str, Enum):
     """How atoms are ranked against a sector."""
 
     W2 = "w2"  # eq. 7: squared 2-Wasserstein distance of hits plus that of free points
-    NORMALISED = (
-        "normalised"  # the authors' code: each divided by its largest over all candidates, then added
-    )
+    # the authors' code: each divided by its largest over all candidates, then added
+    NORMALISED = "normalised"
 
 
 class Ranking(NamedTuple):
@@ -29,19 +28,13 @@ class Ranking(NamedTuple):
     n_hits: int = 48  # points compared, at most; cost grows with their square
     n_free: int = 32
     voxel_m: float = 0.4  # points are thinned to one a voxel first; 0 draws them at random
-    reg_m2: float = (
-        5.0  # weight of the entropy: a blur of about 2 m ranks as a sharper plan does, in a tenth of the time
-    )
+    # weight of the entropy: a blur of about 2 m ranks as a sharper plan does, in a tenth of the time
+    reg_m2: float = 5.0
     tolerance: float = 3e-2  # of the marginals, in L1: enough to rank
     max_iterations: int = 1000
     score: RankScore = RankScore.W2
-    rotations_deg: tuple[float, ...] = (
-        -30.0,
-        -15.0,
-        0.0,
-        15.0,
-        30.0,
-    )  # of the atom: sectors are 60 degrees wide
+    # of the atom: sectors are 60 degrees wide
+    rotations_deg: tuple[float, ...] = (-30.0, -15.0, 0.0, 15.0, 30.0)
 
 
 class Match(NamedTuple):

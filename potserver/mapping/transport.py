@@ -23,12 +23,10 @@ class CouplingOptions(NamedTuple):
     reg: float = 0.002  # weight of the entropy, as a share of the largest cost
     tolerance: float = 1e-3  # of the marginals, in L1
     max_iterations: int = 2000
-    is_label_aware: bool = (
-        True  # free-space kernels move with the free points' own coupling; false: with the hits'
-    )
-    stays_in_sector: bool = (
-        True  # kernels carried out of their sector are left out; false: only those out of the circle
-    )
+    # free-space kernels move with the free points' own coupling; false: with the hits'
+    is_label_aware: bool = True
+    # kernels carried out of their sector are left out; false: only those out of the circle
+    stays_in_sector: bool = True
     out_of_sample: OutOfSample = OutOfSample.NEAREST
 
 

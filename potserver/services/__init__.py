@@ -1,1 +1,1 @@
-"""The home of `MappingSettings` in earlier versions, kept for scripts that import it from here."""
+"""A name that scripts outside the project import; what it names lives in `potserver.mapping`."""

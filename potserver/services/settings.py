@@ -1,4 +1,4 @@
-"""`MappingSettings`, which lives in `potserver.mapping.settings` now."""
+"""`MappingSettings`, by the path that scripts outside the project use."""
 
 from potserver.mapping.settings import MappingSettings
 

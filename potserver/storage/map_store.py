@@ -38,6 +38,7 @@ log = get_logger("potserver.store")
 JOURNAL, TILES, SAVED = "journal.sqlite", "tiles.sqlite", "saved"
 SNAPSHOT_SCANS = 50  # a restart integrates at most so many again: seconds
 SNAPSHOT_BYTES = 64 * 2**20  # large scans make a snapshot due earlier
+MAX_SAVED = 100  # copies with a name: whoever reaches the server may ask for one more
 _REPORT_S = 2.0  # between two lines of progress
 _IN_MEMORY = "this server keeps its maps in memory only: start it with --store DIR, or without --in-memory"
 
@@ -73,7 +74,7 @@ class MapStore:
         fsync: bool = True,
         snapshot_scans: int = SNAPSHOT_SCANS,
         snapshot_bytes: int = SNAPSHOT_BYTES,
-        max_saved: int = 100,
+        max_saved: int = MAX_SAVED,
     ) -> None:
         """Open the folder `<folder>/<map_id>`, or make it.
 
@@ -263,7 +264,7 @@ class MapStore:
         others = [p for p in self._saved.glob("*.map") if p != path]
         if len(others) >= self._max_saved:
             raise TooLargeError(
-                f"{len(others)} maps are saved already, the limit is {self._max_saved} (store.max_saved)"
+                f"{len(others)} maps are saved already, the limit is {self._max_saved}: move some out of {self._saved}"
             )
         n_bytes = write_map(path, state, Origin(self._map_id, self._keeps_evidence, stamps))
         self._health.count("store.saved")
@@ -304,9 +305,8 @@ class MapStore:
             self._journal.close(complete_to=complete_to)
             return True
         except StorageError as error:
-            log.error(
-                "last_snapshot_failed", map_id=self._map_id, detail=str(error)
-            )  # the journal has it all
+            # the journal has it all
+            log.error("last_snapshot_failed", map_id=self._map_id, detail=str(error))
             return False
         finally:
             self._tiles.close()
@@ -397,7 +397,3 @@ class MemoryOnly:
             UnsupportedError: always.
         """
         raise UnsupportedError(_IN_MEMORY)
-
-    def close(self) -> bool:
-        """Nothing to do."""
-        return True

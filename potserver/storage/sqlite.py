@@ -114,24 +114,13 @@ def after_damage(path: Path) -> str:
 
 
 @contextlib.contextmanager
-def writing(path: Path) -> Iterator[None]:
-    """Give SQLite's errors our names: what cannot be written is the disk's fault."""
-    try:
-        yield
-    except sqlite3.Error as error:
-        if _is_locked(error):
-            raise _in_use(path) from error
-        raise StorageError(f"cannot write {path}: {error}") from error
-
-
-@contextlib.contextmanager
 def transaction(connection: sqlite3.Connection, path: Path) -> Iterator[None]:
     """All or nothing, and on the disk when the block has ended.
 
     Raises:
         StorageError: the disk refuses; nothing was changed.
     """
-    with writing(path):
+    try:
         connection.execute("BEGIN IMMEDIATE")
         try:
             yield
@@ -142,6 +131,10 @@ def transaction(connection: sqlite3.Connection, path: Path) -> Iterator[None]:
                 with contextlib.suppress(sqlite3.Error):
                     connection.execute("ROLLBACK")
             raise
+    except sqlite3.Error as error:  # what cannot be written is the disk's fault
+        if _is_locked(error):
+            raise _in_use(path) from error
+        raise StorageError(f"cannot write {path}: {error}") from error
 
 
 def _check(connection: sqlite3.Connection, path: Path, kind: Kind) -> None:

@@ -8,7 +8,6 @@ seal     of head and body
 
 from __future__ import annotations
 
-import dataclasses
 import struct
 import zlib
 from typing import Any, NamedTuple
@@ -17,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potserver.domain.tiles import CARRIED, MapKernels, Tile, TileGrid, TileIndex
-from potserver.domain.types import KernelSet
+from potserver.domain.types import KERNEL_ARRAYS, KernelSet
 from potserver.errors import MapFileError, ShapeError
 from potserver.numerics.evidence import LABELS, Rows
 from potserver.storage.seal import sealed, unsealed
@@ -81,9 +80,8 @@ def decode_tile(data: bytes, grid: TileGrid, n_robots: int) -> tuple[TileIndex, 
     n_bytes = sum(n * max(1, c.width) * np.dtype(c.dtype).itemsize for c, n in sizes)
     try:
         inflate = zlib.decompressobj()
-        plain = inflate.decompress(
-            content[_HEAD.size :], n_bytes + 1
-        )  # one more would show that there is more
+        # one byte more would show that there is more
+        plain = inflate.decompress(content[_HEAD.size :], n_bytes + 1)
         if len(plain) != n_bytes or not inflate.eof:
             raise MapFileError(f"tile {(x, y, z)} is not of the size that it says", reason="damaged")
         arrays, start = {}, 0
@@ -97,7 +95,7 @@ def decode_tile(data: bytes, grid: TileGrid, n_robots: int) -> tuple[TileIndex, 
                 arrays["source"],
             ),
             MapKernels(
-                kernels=KernelSet(**{f.name: arrays[f.name] for f in dataclasses.fields(KernelSet)}),
+                kernels=KernelSet(**{name: arrays[name] for name in KERNEL_ARRAYS}),
                 **{c.name: arrays[c.name] for c in _MAP_KERNELS},
             ),
             revision,

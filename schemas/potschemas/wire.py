@@ -28,9 +28,8 @@ from potschemas.messages import MAX_AXES, MAX_AXIS_LENGTH, Array, DType, ErrorCo
 MessageT = TypeVar("MessageT", bound=Message)
 
 MIME = "application/msgpack"
-MAX_DEPTH = (
-    8  # maps and lists inside one another; the deepest message has 5 levels, the rest is for new fields
-)
+# maps and lists inside one another; the deepest message has 5 levels, the rest is for new fields
+MAX_DEPTH = 8
 MAX_ITEMS = 100_000  # entries of one map or list; arrays are bytes, so real messages stay far below
 MAX_VALUES = 100_000  # values and keys in all; a revision tick of 24,000 tiles fits
 MAX_STRING_BYTES = 65_536

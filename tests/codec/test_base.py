@@ -59,10 +59,12 @@ def test_sizes_and_encodings() -> None:
     check_size(10, 10, "cloud")
     with pytest.raises(errors.TooLargeError, match="cloud of 11 bytes"):
         check_size(11, 10, "cloud")
-    for encoding in (None, "", "zenoh/bytes", "application/msgpack;pot.cloud.v1"):
+    for encoding in (None, "", "zenoh/bytes", "application/msgpack", "application/msgpack;pot.cloud.v1"):
         check_encoding(encoding, messages.Cloud)
     with pytest.raises(errors.BadMessageError, match=r"pot\.pose\.v1"):
         check_encoding("application/msgpack;pot.pose.v1", messages.Cloud)
+    with pytest.raises(errors.BadMessageError, match="application/json"):
+        check_encoding("application/json", messages.Cloud)
 
 
 def test_an_empty_payload_is_a_message_of_defaults() -> None:

@@ -29,6 +29,7 @@ from potserver.server import MapServer
 
 DEADLINE_S = 30.0
 ROOT = "pot/v1"
+MakeRig = Callable[..., "Rig"]  # the fixture `make_rig`
 _BY_SCHEMA = {kind.schema: kind for kind in messages.ALL_MESSAGES}
 
 
@@ -166,6 +167,9 @@ def make_cloud(seq: int = 0, **changes: Any) -> messages.Cloud:
 def points_query(points: Any, **changes: Any) -> messages.PointsQuery:
     """Ask at these points."""
     return messages.PointsQuery(points=wire.encode_array(np.asarray(points, np.float64)), **changes)
+
+
+HERE = points_query([[0.0, 0, 0]])
 
 
 def in_background(work: Callable[[], Any]) -> Callable[[], Any]:
@@ -358,7 +362,7 @@ class Rig:
 
 
 @pytest.fixture
-def make_rig() -> Iterator[Callable[..., Rig]]:
+def make_rig() -> Iterator[MakeRig]:
     """Makes servers with fake mappers; keyword arguments are dotted settings with `__` for the dot."""
     with contextlib.ExitStack() as stack:
 

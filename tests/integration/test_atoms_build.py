@@ -13,6 +13,8 @@ import pytest
 
 from potserver.domain.dictionary import AtomDictionary
 
+from .scripted import free_port
+
 TIMEOUT_S = 240.0
 RECIPE = """
 tolerance_m = 0.5
@@ -111,8 +113,9 @@ def test_an_interrupt_ends_the_workers_and_leaves_nothing(folder: Path) -> None:
     assert not list(folder.glob("none.atoms*"))
 
 
-def test_a_cluster_that_is_not_there(folder: Path, free_port: int) -> None:
+def test_a_cluster_that_is_not_there(folder: Path) -> None:
+    port = free_port()
     pytest.importorskip("ray", reason="Ray has no wheel for this platform")
-    done = _build(folder, "none.atoms", "--ray", f"127.0.0.1:{free_port}")
+    done = _build(folder, "none.atoms", "--ray", f"127.0.0.1:{port}")
     assert done.returncode == 2
-    assert done.stderr.startswith(f"potserver: no Ray cluster at 127.0.0.1:{free_port}")
+    assert done.stderr.startswith(f"potserver: no Ray cluster at 127.0.0.1:{port}")

@@ -8,8 +8,6 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 import pytest
@@ -21,17 +19,14 @@ from potserver.errors import EmptyError
 from .conftest import (
     DEADLINE_S,
     ROOT,
+    MakeRig,
     balance,
     drain,
     in_background,
     make_cloud,
-    points_query,
     pose_message,
     until,
 )
-
-HERE = points_query([[0.0, 0, 0]])
-MakeRig = Callable[..., Any]
 
 
 def test_a_cloud_gives_one_receipt_its_parameters_and_a_tick(make_rig: MakeRig) -> None:

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
-
 import numpy as np
 
 from potschemas import messages
@@ -13,15 +10,13 @@ from potserver.adapters.intake import Barrier
 
 from .conftest import (
     DEADLINE_S,
+    HERE,
+    MakeRig,
     drain,
     in_background,
     make_cloud,
-    points_query,
     until,
 )
-
-HERE = points_query([[0.0, 0, 0]])
-MakeRig = Callable[..., Any]
 
 
 def test_clear_comes_after_the_clouds_before_it_and_forgets_the_stamps(make_rig: MakeRig) -> None:

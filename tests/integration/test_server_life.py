@@ -6,8 +6,6 @@ import dataclasses
 import math
 import queue
 import threading
-from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 import pytest
@@ -23,19 +21,17 @@ from potserver.server import MapServer
 
 from .conftest import (
     DEADLINE_S,
+    HERE,
     ROOT,
     Client,
     FakeMapper,
     FakeSnapshot,
+    MakeRig,
     drain,
     in_background,
     make_cloud,
-    points_query,
     until,
 )
-
-HERE = points_query([[0.0, 0, 0]])
-MakeRig = Callable[..., Any]
 
 
 def test_the_token_comes_only_after_the_warm_up(make_rig: MakeRig) -> None:

@@ -8,7 +8,6 @@ import subprocess
 import sys
 import time
 import types
-from collections.abc import Callable
 from typing import Any
 
 import pytest
@@ -18,15 +17,14 @@ from potschemas.messages import ErrorCode
 
 from .conftest import (
     DEADLINE_S,
+    HERE,
     ROOT,
+    MakeRig,
     in_background,
     make_cloud,
     points_query,
     until,
 )
-
-HERE = points_query([[0.0, 0, 0]])
-MakeRig = Callable[..., Any]
 
 
 def test_a_bug_in_a_query_is_internal_and_the_worker_lives(make_rig: MakeRig) -> None:

@@ -10,7 +10,7 @@ import pytest
 from potschemas.answers import PRIOR_VAR
 from potserver.domain.dictionary import AtomDictionary
 from potserver.domain.tiles import CARRIED, COARSE, FINE, TiledMap
-from potserver.domain.types import KernelSet, Scan, yaw_pose
+from potserver.domain.types import Scan, yaw_pose
 from potserver.errors import SettingsError, SolverError
 from potserver.evaluation.ablations import ABLATIONS
 from potserver.mapping import fusion
@@ -19,6 +19,8 @@ from potserver.mapping.service import MappingService
 from potserver.mapping.settings import MappingSettings
 from potserver.numerics.beams import Beams
 from potserver.numerics.warm_fit import WarmFit
+
+from .kernels import assert_same
 
 NO_ATOMS = AtomDictionary(())
 ROOM = np.array([6.0, 4.0, 2.5])  # m, half the length, width and height
@@ -57,11 +59,6 @@ def _service(dictionary: AtomDictionary | None = NO_ATOMS, *, threads: int = 2, 
 def _tiled(service: MappingService) -> TiledMap:
     assert service.state.tiled is not None
     return service.state.tiled
-
-
-def _same(one: KernelSet, other: KernelSet) -> None:
-    for field in dataclasses.fields(KernelSet):
-        np.testing.assert_array_equal(getattr(one, field.name), getattr(other, field.name))
 
 
 @pytest.mark.parametrize(
@@ -187,8 +184,8 @@ def test_the_map_is_the_same_to_the_bit_on_any_number_of_threads() -> None:
         for k in range(3):
             service.integrate(_scan(k, at=(0.5 * k, 0.0)))
         kernels.append(service.snapshot.kernels)
-    _same(kernels[0], kernels[1])
-    _same(kernels[0], kernels[2])
+    assert_same(kernels[0], kernels[1])
+    assert_same(kernels[0], kernels[2])
 
 
 def test_a_scan_changes_only_the_tiles_around_it() -> None:
@@ -226,7 +223,7 @@ def test_a_solve_that_fails_leaves_no_trace(fails: str, monkeypatch: pytest.Monk
         np.testing.assert_array_equal(tile.rows.sums, sums[index])
     for s in (service, twin):
         s.integrate(_scan(2))
-    _same(service.snapshot.kernels, twin.snapshot.kernels)
+    assert_same(service.snapshot.kernels, twin.snapshot.kernels)
 
 
 def test_a_solve_that_got_stuck_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:

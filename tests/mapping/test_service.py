@@ -10,12 +10,14 @@ import pytest
 
 from potserver.domain.dictionary import AtomDictionary
 from potserver.domain.kernel_map import KernelMap
-from potserver.domain.types import KernelSet, MapUpdate, Scan, yaw_pose
+from potserver.domain.types import MapUpdate, Scan, yaw_pose
 from potserver.errors import EmptyError
 from potserver.mapping.carrying import Carrier
 from potserver.mapping.refinement import borrowed_prior, flat_prior
 from potserver.mapping.service import MappingService, method_of
 from potserver.mapping.settings import PROFILES, MappingSettings
+
+from .kernels import assert_same
 
 ROOM = np.array(
     [6.0, 4.0, 2.5]
@@ -92,11 +94,6 @@ def _nll(kernels: KernelMap, points: np.ndarray, occupied: np.ndarray) -> float:
     return float(-np.where(occupied, np.log(p), np.log(1 - p)).mean())
 
 
-def _same(one: KernelSet, other: KernelSet) -> None:
-    for field in dataclasses.fields(KernelSet):
-        np.testing.assert_array_equal(getattr(one, field.name), getattr(other, field.name))
-
-
 def _check_update(update: MapUpdate, service: MappingService) -> None:
     assert update.map_revision == service.snapshot.map_revision
     assert update.map_kernels == len(service.snapshot)
@@ -164,7 +161,7 @@ def test_the_same_service_twice_is_the_same_to_the_bit() -> None:
         for k in range(2):
             service.integrate(_room_scan(x=0.4 * k, seed=k, n=2000))
         kernels.append(service.snapshot.kernels)
-    _same(*kernels)
+    assert_same(*kernels)
 
 
 def test_another_seed_draws_other_free_points() -> None:
@@ -200,7 +197,7 @@ def test_a_scan_that_fails_leaves_no_trace(profile: str, monkeypatch: pytest.Mon
     assert dict(service.atom_usage) == usage
     for s in (service, twin):
         s.integrate(_room_scan(seed=3))
-    _same(service.snapshot.kernels, twin.snapshot.kernels)
+    assert_same(service.snapshot.kernels, twin.snapshot.kernels)
 
 
 @pytest.mark.parametrize("profile", PROFILES)
@@ -228,7 +225,7 @@ def test_clear_forgets_and_goes_on_counting() -> None:
     assert service.integrate(_room_scan()).map_revision == 3
     fresh = _service()
     fresh.integrate(_room_scan())
-    _same(service.snapshot.kernels, fresh.snapshot.kernels)
+    assert_same(service.snapshot.kernels, fresh.snapshot.kernels)
 
 
 @pytest.mark.parametrize("height", [0.0, 0.35])

@@ -143,7 +143,7 @@ def test_scripts_that_the_documents_name_exist(root: Path) -> None:
     named = {
         (path.name, found)
         for path in documents(root)
-        for found in re.findall(r"python ((?:benchmarks|docs)/[\w/]+\.py)", path.read_text())
+        for found in re.findall(r"python ((?:benchmarks|docs|clients/examples)/[\w/]+\.py)", path.read_text())
     }
     assert named
     assert not [f"{name}: no {found}" for name, found in sorted(named) if not (root / found).is_file()]

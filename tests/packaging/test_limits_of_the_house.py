@@ -6,8 +6,6 @@ import ast
 from collections.abc import Iterator
 from pathlib import Path
 
-import pytest
-
 from tests.conftest import ROOT
 
 MOST_LINES = 600  # of a file
@@ -116,11 +114,3 @@ def test_the_import_contract_names_every_module(project_file: dict) -> None:
         assert any(f"{module}.".startswith(f"{name}.") for name in named) or any(
             name.startswith(f"{module}.") for name in named
         ), f"{module} is in no layer"
-
-
-@pytest.fixture(scope="module")
-def project_file() -> dict:
-    """pyproject.toml."""
-    from tests.conftest import tomllib
-
-    return tomllib.loads((ROOT / "pyproject.toml").read_text())

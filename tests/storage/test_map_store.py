@@ -328,7 +328,7 @@ def test_saved_maps_are_bounded_in_number(tmp_path: Path, open_map: OpenMap) -> 
     ours = open_map(tmp_path, max_saved=1)
     ours.store.save("a", ours.mapper, {})
     ours.store.save("a", ours.mapper, {})
-    with pytest.raises(TooLargeError, match="max_saved"):
+    with pytest.raises(TooLargeError, match="the limit is 1"):
         ours.store.save("b", ours.mapper, {})
     assert [path.name for path in (tmp_path / "saved").iterdir()] == ["a.map"]
 

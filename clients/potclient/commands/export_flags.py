@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import argparse
-import contextlib
-import sys
-from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from potclient import export
-from potclient.commands.shared import EXIT_OK, add_box_arguments, note, positive, progress_bar, say
+from potclient.commands.shared import EXIT_OK, add_box_arguments, note, part_bar, positive, say
 from potclient.errors import UsageError
 
 EXPORT_KINDS = ("ply", "npz", "pgm", "bt")
@@ -48,7 +45,7 @@ def check_export_flags(arguments: argparse.Namespace) -> None:
 
 def export_map(source: export.MapSource, arguments: argparse.Namespace) -> int:
     """Write a map as the flags want it, and say what was written."""
-    with _part_bar(arguments.quiet) as progress:
+    with part_bar(quiet=arguments.quiet) as progress:
         if arguments.kind in ("pgm", "bt"):
             box = _export_box(arguments, source)
             run = export.export_pgm if arguments.kind == "pgm" else export.export_bt
@@ -83,15 +80,3 @@ def _export_box(arguments: argparse.Namespace, source: export.MapSource) -> expo
         if arguments.band is not None:
             lower, upper = [*lower[:2], arguments.band[0]], [*upper[:2], arguments.band[1]]
     return export.CellBox.around(lower, upper, arguments.resolution)
-
-
-@contextlib.contextmanager
-def _part_bar(quiet: bool) -> Iterator[Callable[[int, int], None] | None]:
-    """A progress bar of parts when stderr is a terminal."""
-    progress = None if quiet or not sys.stderr.isatty() else progress_bar(0, "parts")
-    if progress is None:
-        yield None
-        return
-    bar, task = progress
-    with bar:
-        yield lambda done, total: bar.update(task, completed=done, total=total)

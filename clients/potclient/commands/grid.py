@@ -3,13 +3,22 @@
 from __future__ import annotations
 
 import argparse
-import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from potclient.commands.shared import EXIT_OK, add_box_arguments, add_command, client_of, positive, say
+import numpy as np
+
+from potclient.commands.shared import (
+    EXIT_OK,
+    add_box_arguments,
+    add_command,
+    client_of,
+    part_bar,
+    positive,
+    say,
+)
 from potclient.errors import UsageError
+from potclient.export import bounds_of
 from potclient.pictures import draw_layer
 
 
@@ -44,18 +53,11 @@ def run(arguments: argparse.Namespace) -> int:
     with client_of(arguments) as client:
         lower, upper = arguments.lower, arguments.upper
         if lower is None or upper is None:
-            info = client.info()
-            if info.lower is None or info.upper is None:
-                raise UsageError(
-                    "grid: the map is empty; publish something first, or give --lower and --upper"
-                )
-            lower = info.lower if lower is None else lower
-            upper = (
-                [max(b, a + arguments.resolution) for a, b in zip(lower, info.upper, strict=True)]
-                if upper is None
-                else upper
-            )
-        grid = client.grid(lower, upper, arguments.resolution, progress=_part_progress())
+            low, high = bounds_of(client)
+            lower = low if lower is None else np.asarray(lower)
+            upper = np.maximum(high, lower + arguments.resolution) if upper is None else upper
+        with part_bar() as progress:
+            grid = client.grid(lower, upper, arguments.resolution, progress=progress)
     say(
         f"{' x '.join(str(n) for n in grid.shape)} cells of {grid.resolution:g} m, revision {grid.revision}: "
         f"{float(grid.observed.mean()):.1%} observed, {int(((grid.mean > 0.5) & grid.observed).sum())} occupied"
@@ -67,14 +69,3 @@ def run(arguments: argparse.Namespace) -> int:
         draw_layer(grid, arguments.png, level_m=arguments.level)
         say(f"wrote {arguments.png}")
     return EXIT_OK
-
-
-def _part_progress() -> Callable[[int, int], None] | None:
-    if not sys.stderr.isatty():
-        return None
-
-    def show(received: int, total: int) -> None:
-        sys.stderr.write(f"\rpart {received} of {total}" + ("\n" if received == total else ""))
-        sys.stderr.flush()
-
-    return show

@@ -15,9 +15,8 @@ from potclient.commands.shared import EXIT_OK, add_box_arguments, add_command, c
 from potclient.errors import LostReplyError, NoServerError, QueryTimeoutError, UsageError
 from potclient.mirror import MapMirror, MirrorUpdate
 
-_POLL_S = (
-    2.0  # `mirror` asks so often even if nothing was announced: a server that was restarted announces nothing
-)
+# `mirror` asks so often even if nothing was announced: a server that was restarted announces nothing
+_POLL_S = 2.0
 
 
 def add(commands: Any) -> None:

@@ -5,9 +5,8 @@ from __future__ import annotations
 import argparse
 import math
 
-import numpy as np
-
 from potclient.arrays import Float64
+from potclient.poses import yaw_pose
 
 
 def add_pose_flag(parser: argparse.ArgumentParser) -> None:
@@ -23,5 +22,4 @@ def add_pose_flag(parser: argparse.ArgumentParser) -> None:
 
 def pose_of(x_m: float, y_m: float, z_m: float, yaw_deg: float) -> Float64:
     """(4, 4) transform of what `--pose` says."""
-    c, s = math.cos(math.radians(yaw_deg)), math.sin(math.radians(yaw_deg))
-    return np.array([[c, -s, 0, x_m], [s, c, 0, y_m], [0, 0, 1, z_m], [0, 0, 0, 1]], np.float64)
+    return yaw_pose(x_m, y_m, math.radians(yaw_deg), z_m)

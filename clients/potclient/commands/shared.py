@@ -249,3 +249,15 @@ def progress_bar(total: int, what: str = "scans") -> tuple[Any, Any] | None:
         return None
     bar = Progress(console=Console(stderr=True), transient=True)
     return bar, bar.add_task(what, total=total)
+
+
+@contextlib.contextmanager
+def part_bar(*, quiet: bool = False) -> Iterator[Callable[[int, int], None] | None]:
+    """A progress bar of parts when stderr is a terminal."""
+    progress = None if quiet or not sys.stderr.isatty() else progress_bar(0, "parts")
+    if progress is None:
+        yield None
+        return
+    bar, task = progress
+    with bar:
+        yield lambda done, total: bar.update(task, completed=done, total=total)

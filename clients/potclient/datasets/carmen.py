@@ -13,6 +13,7 @@ import numpy as np
 from potclient.arrays import Float64
 from potclient.datasets.scans import RecordedScan, Recording, growing, read_table
 from potclient.errors import DatasetError
+from potclient.poses import yaw_pose
 
 DEFAULT_NO_RETURN_M = 50.0
 DEFAULT_MAX_RANGE_M = 30.0
@@ -87,12 +88,10 @@ class CarmenLog(Recording):
         range_m = np.where(is_return, range_m, np.minimum(range_m, self._max_range_m))
         points = np.stack([range_m * np.cos(angle), range_m * np.sin(angle), np.zeros_like(range_m)], axis=1)
         x, y, yaw = self._xyt[i]
-        c, s = math.cos(yaw), math.sin(yaw)
-        pose = np.array([[c, -s, 0, x], [s, c, 0, y], [0, 0, 1, 0], [0, 0, 0, 1]], np.float64)
         return RecordedScan(
             points=points.astype(np.float32),
             is_return=is_return,
-            T_map_sensor=pose,
+            T_map_sensor=yaw_pose(x, y, yaw),
             stamp_ns=self._stamps[i],
             name=f"{self.path.name}:{line.number}",
             is_planar=True,
@@ -133,10 +132,8 @@ def _read_lines(path: Path) -> list[_Line]:
 def _parse(number: int, words: list[str]) -> _Line:
     if words[0] == "FLASER":
         n, first = int(words[1]), 2
-        start, step = (
-            -math.pi / 2,
-            math.pi / (n - n % 2),
-        )  # 180: one degree up to +89; 181: one degree up to +90
+        # 180: one degree up to +89; 181: one degree up to +90
+        start, step = -math.pi / 2, math.pi / (n - n % 2)
         pose_at, stamp_at = first + n, first + n + 6
     else:
         n, first = int(words[8]), 9

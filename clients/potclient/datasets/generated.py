@@ -8,8 +8,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from potclient.arrays import Bool, Float64, as_points
+from potclient.arguments import as_points
+from potclient.arrays import Bool, Float64
 from potclient.datasets.scans import RecordedScan, Recording
+from potclient.poses import yaw_pose
 
 _GROUND_Z_M = 0.0
 _WALL_M = 0.5
@@ -63,11 +65,8 @@ class GeneratedScene:
     def pose(self, k: int, n_loop: int = 100) -> Float64:
         """(4, 4): where the sensor is at step k of a round of `n_loop` steps, looking ahead."""
         angle = 2 * math.pi * k / n_loop
-        yaw = angle + math.pi / 2
-        c, s = math.cos(yaw), math.sin(yaw)
         x, y = self._path_radius_m * math.cos(angle), self._path_radius_m * math.sin(angle)
-        z = 0.0 if self.planar else 1.5
-        return np.array([[c, -s, 0, x], [s, c, 0, y], [0, 0, 1, z], [0, 0, 0, 1]], np.float64)
+        return yaw_pose(x, y, angle + math.pi / 2, 0.0 if self.planar else 1.5)
 
     def scan(self, k: int, n_loop: int = 100, period_s: float = 0.1) -> RecordedScan:
         """Scan k from `pose(k)`."""

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from potclient.arrays import as_points
+from potclient.arguments import as_points
 from potclient.errors import OverloadedError
 from potclient.link import Link
 from potclient.occupancy import Occupancy

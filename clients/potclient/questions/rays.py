@@ -11,8 +11,8 @@ import msgspec
 import numpy as np
 from numpy.typing import ArrayLike
 
-from potclient.arguments import positive, positive_or_none, unknown_kind
-from potclient.arrays import Float32, arrays_of, as_points
+from potclient.arguments import as_points, positive, positive_or_none, unknown_kind
+from potclient.arrays import Float32, arrays_of
 from potclient.errors import TooLargeError, UsageError
 from potclient.link import Link
 from potschemas import messages

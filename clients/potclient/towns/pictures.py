@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potclient.arrays import Float64
-from potclient.errors import UsageError
+from potclient.pictures import load_pyplot
 from potclient.towns.raycast import RayScene
 from potclient.towns.recording import PERIOD_S, TownRecording, open_town
 from potclient.towns.solids import Kind, SolidSet
@@ -44,7 +44,7 @@ def draw_plan(recording: TownRecording, path: Path, *, margin_m: float | None = 
     Raises:
         UsageError: matplotlib is missing.
     """
-    pyplot = _pyplot()
+    pyplot = load_pyplot()
     town = recording.town
     lower, upper = _extent(recording, margin_m)
     wide, high = upper - lower
@@ -166,7 +166,7 @@ def draw_styles(path: Path, names: tuple[str, ...]) -> None:
     Raises:
         UsageError: matplotlib is missing; DatasetError: open3d is, or a name means nothing.
     """
-    pyplot = _pyplot()
+    pyplot = load_pyplot()
     figure, axes = pyplot.subplots(
         3,
         len(names),
@@ -263,17 +263,6 @@ def _hull(points: Float64) -> Float64:
 
 def _turn(a: Any, b: Any, c: Any) -> float:
     return float((b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0]))
-
-
-def _pyplot() -> Any:
-    try:
-        import matplotlib
-    except ImportError as error:
-        raise UsageError("pictures need the package matplotlib: pip install matplotlib") from error
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-
-    return pyplot
 
 
 def main(words: list[str]) -> None:

@@ -40,9 +40,8 @@ class Shape:
 
     def __init__(self, *faces: Sequence[int]) -> None:
         self.n_vertices = 1 + max(max(face) for face in faces)
-        self.corners: Int64 = np.array(
-            [face[:3] for face in faces]
-        )  # (F, 3) three vertices that span each face
+        # (F, 3) three vertices that span each face
+        self.corners: Int64 = np.array([face[:3] for face in faces])
         self.triangles: Int64 = np.array(
             [(face[0], face[k], face[k + 1]) for face in faces for k in range(1, len(face) - 1)]
         )

@@ -54,10 +54,8 @@ class StreetGrid:
         cells = np.zeros((len(points), 2), np.int64)
         for axis in (0, 1) if len(points) else ():
             k = np.floor(points[:, axis] / self.style.pitch_m[axis]).astype(np.int64)
-            low, high = (
-                int(k.min()) - 1,
-                int(k.max()) + 2,
-            )  # streets are less than half a pitch from their regular place
+            # streets are less than half a pitch from their regular place
+            low, high = int(k.min()) - 1, int(k.max()) + 2
             lines = np.array([self.street(axis, i).center_m for i in range(low, high + 1)])
             cells[:, axis] = low + np.searchsorted(lines, points[:, axis], side="right") - 1
         return cells

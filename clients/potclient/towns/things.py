@@ -196,4 +196,5 @@ def cupboard(rng: np.random.Generator) -> list[Part]:
 
 
 def street_tree(rng: np.random.Generator, low: float, high: float, thin: float, wide: float) -> list[Part]:
+    """A tree of random height, `low` to `high` m, and crown, `thin` to `wide` m in radius."""
     return tree(rng, 0.0, 0.0, height_m=rng.uniform(low, high), crown_m=rng.uniform(thin, wide))

@@ -7,8 +7,10 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike
 
-from potclient.arrays import Bool, Float64, as_points
+from potclient.arguments import as_points
+from potclient.arrays import Bool, Float64
 from potclient.errors import DatasetError
+from potclient.poses import yaw_pose
 from potclient.towns.blocks import build_block
 from potclient.towns.site import EAST, NORTH, SOUTH, WEST, Block, Door, Name, Parked
 from potclient.towns.solids import Int64, Part, SolidSet
@@ -72,10 +74,7 @@ class Town:
         """(4, 4) T_map_sensor on the drive; in a 2D town z is 0, else the road is z = 0 and the vehicle sways a little."""
         distance = self.style.speed_m_s * time_s
         x, y, yaw = self.drive.at(np.array([distance]))[0]
-        c, s = math.cos(yaw), math.sin(yaw)
-        pose = np.eye(4)
-        pose[:2, :2] = [[c, -s], [s, c]]
-        pose[:2, 3] = x, y
+        pose = yaw_pose(x, y, yaw)
         if self.slice_m is not None:
             return pose
         pose[2, 3] = self.style.sensor_m

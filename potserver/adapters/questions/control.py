@@ -13,8 +13,9 @@ from potschemas import keys, messages
 from potserver.adapters.intake import Barrier, IntakeQueue
 from potserver.adapters.key_exprs import is_wild, last_chunk
 from potserver.adapters.outbox import Outbox
-from potserver.adapters.queryable import BUG, Queryable, check_query, payload_of, reply, reply_error
+from potserver.adapters.queryable import Queryable
 from potserver.adapters.questions.question import Served
+from potserver.adapters.replies import BUG, check_query, payload_of, reply, reply_error
 from potserver.adapters.writer import MapWriter
 from potserver.codec.base import decode, encode
 from potserver.codec.clouds import decode_transform

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
-import importlib
 import re
-import sys
 from collections.abc import Mapping
 from importlib import resources
 from pathlib import Path
@@ -17,8 +15,7 @@ import msgspec
 from potserver.atoms.learning import LearningSettings
 from potserver.errors import SettingsError
 from potserver.recordings import BUNDLED_PREFIX, Reader, scan_numbers
-
-tomllib: Any = importlib.import_module("tomllib" if sys.version_info >= (3, 11) else "tomli")
+from potserver.toml import read_toml
 
 BUILTIN_RECIPE = "builtin_atoms.toml"
 SHARE_OF_RADIUS = 0.15  # of an atom's radius: the tolerance where none is stated
@@ -97,14 +94,7 @@ def read_recipe(path: str | Path) -> Recipe:
     Raises:
         SettingsError: no such file, not TOML, an unknown key, or an illegal value; the message says which.
     """
-    path = Path(path)
-    try:
-        tree = tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise SettingsError(f"cannot read recipe {path}: {error.strerror}") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise SettingsError(f"recipe {path} is not TOML: {error}") from error
-    return parse_recipe(tree, str(path))
+    return parse_recipe(read_toml(Path(path), "recipe"), str(path))
 
 
 def builtin_recipe() -> Recipe:

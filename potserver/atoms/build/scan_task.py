@@ -93,7 +93,7 @@ def _learn_scan(task: ScanTask, on_epoch: Callable[[Progress], None] | None) -> 
     # beams held out as everywhere in the project: what a map is judged on was never learned
     numbers = range(task.number, min(task.number + task.window, len(recording)))
     parts = [HoldOut().split(recording[number], number) for number in numbers]
-    recorded = parts[0][0]
+    recorded, held_out = parts[0][0], [labels for _, labels in parts]
     dims = 2 if recorded.is_planar else 3
     if task.dims not in (None, dims):
         raise DatasetError(f"{recorded.name} has {dims} dimensions, where the recipe says {task.dims}")
@@ -106,7 +106,7 @@ def _learn_scan(task: ScanTask, on_epoch: Callable[[Progress], None] | None) -> 
     def scored(at: SectorEpoch) -> None:
         where = SectorOf(recorded, at.sector, task.settings)
         kernels = _means_alone(at.epoch.hinge, at.epoch.gamma, at.epoch.weight)
-        scores = _judge(kernels, where, [labels for _, labels in parts])
+        scores = _judge(kernels, where, held_out)
         on_epoch(Progress(task, at.sector, at.epoch.epoch, at.epoch.n_epochs, scores))  # type: ignore[misc]
 
     atoms = learn_atoms(
@@ -119,7 +119,6 @@ def _learn_scan(task: ScanTask, on_epoch: Callable[[Progress], None] | None) -> 
     for atom in atoms:
         where = SectorOf(recorded, int(atom.provenance["sector"]), task.settings)
         kernels = _means_alone(atom.kernels.hinge_mean, atom.kernels.gamma, atom.kernels.weight_mean)
-        held_out = [labels for _, labels in parts]
         own = _judge(kernels, where, held_out)
         reason = _refusal(own, task.quality)
         if own is None or reason is not None:

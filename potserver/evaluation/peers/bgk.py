@@ -6,7 +6,6 @@ import math
 
 import numba as nb
 import numpy as np
-from numpy.typing import NDArray
 
 from potclient.arrays import Bool, Float64
 from potclient.datasets import RecordedScan
@@ -18,8 +17,6 @@ _LENGTH_PER_RESOLUTION = 2.0
 _FREE_STEP_M = 0.5
 _PRIOR = 0.001  # pseudo-counts of each class
 _BYTES_A_CELL = 3 * 2 + 2 * 4  # key, two counts
-
-Int64 = NDArray[np.int64]
 
 
 class BgkMap(Mapper):

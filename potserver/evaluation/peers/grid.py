@@ -79,9 +79,8 @@ class GridMap(Mapper):
         )  # fmt: skip
         self._map = KernelMap(
             kernels.replace(weight_mean=solved.weights, weight_var=solved.var),
-            rule=AnswerRule(
-                mean_moderation=0.0
-            ),  # the mode's own probability, as the published figures of such maps
+            # the mode's own probability, as the published figures of such maps
+            rule=AnswerRule(mean_moderation=0.0),
             threads=self._threads,
         )
 

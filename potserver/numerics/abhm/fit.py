@@ -31,9 +31,8 @@ class AbhmPosterior(NamedTuple):
     objectives: list[float]  # of the means, one an epoch: nats a point
     # evidence lower bound, to second order in the weights, nats a point; one an epoch of the dispersions
     elbos: list[float]
-    converged: (
-        bool  # the means gained little in their last epochs, and their weights were solved to tolerance
-    )
+    # the means gained little in their last epochs, and their weights were solved to tolerance
+    converged: bool
 
 
 def fit_abhm(
