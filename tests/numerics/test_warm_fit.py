@@ -146,3 +146,31 @@ def test_nothing_at_all() -> None:
     blocks = feature_blocks(np.zeros((0, 3)), np.zeros((0, 3)), np.ones(0), edge_m=1.0, cut=0.02)
     none = np.zeros(0, np.float32)
     assert len(warm_fit(blocks, np.zeros(0, bool), none, Prior(none, none), none).weights) == 0
+
+
+def test_soft_labels_end_at_their_optimum(case) -> None:
+    """A label of one half pulls towards 0, from both sides."""
+    blocks, phi, _, counts, mean, var = case
+    soft = np.random.default_rng(4).choice([0.0, 0.5, 1.0], N).astype(np.float32)
+    solver = Solver(60, 60, longest_step=4.0)
+    fit = warm_fit(blocks, soft, counts, Prior(mean, var), np.zeros(K, np.float32), solver)
+
+    def objective(w):
+        f = phi @ w
+        return float(
+            (counts * (np.logaddexp(0.0, f) - soft * f)).sum() + (np.square(w - mean) / (2.0 * var)).sum()
+        )
+
+    best = scipy.optimize.minimize(objective, np.zeros(K), method="L-BFGS-B", options={"maxiter": 5000}).fun
+    assert objective(fit.weights.astype(np.float64)) <= best * (1 + 1e-4) + 0.05
+
+
+def test_a_label_of_one_half_says_that_nothing_is_known() -> None:
+    points = np.zeros((1, 3))
+    blocks = feature_blocks(points, points, np.ones(1), edge_m=1.0, cut=1e-7)
+    one = np.ones(1, np.float32)
+    for start in (-5.0, 5.0):
+        fit = warm_fit(
+            blocks, 0.5 * one, 100.0 * one, Prior(0.0 * one, 100.0 * one), start * one, Solver(30, 10)
+        )
+        assert abs(float(fit.weights[0])) < 0.05

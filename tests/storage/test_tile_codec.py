@@ -22,13 +22,13 @@ GRID = TileGrid.of(10.0, 0.25)
 def make_tile(n_rows: int, n_kernels: int, seed: int = 0, n_robots: int = 3) -> Tile:
     """A tile of noise: nothing in it compresses, and no two numbers are equal by chance."""
     rng = np.random.default_rng(seed)
-    occupied = rng.random(n_rows) < 0.5
-    limit = np.where(occupied, 2 * GRID.voxels, GRID.voxels)[:, None]
+    kind = rng.integers(0, 4, n_rows).astype(np.uint8)
+    limit = np.where(kind & 1, 2 * GRID.voxels, GRID.voxels)[:, None]
     k = n_kernels
     return Tile(
         Rows(
             voxel=(rng.random((n_rows, 3)) * limit).astype(np.int32),
-            occupied=occupied,
+            kind=kind,
             sums=rng.normal(size=(n_rows, 4)).astype(np.float32),
             source=rng.integers(0, n_robots, n_rows).astype(np.int16),
         ),
@@ -116,6 +116,7 @@ def test_a_sound_checksum_does_not_make_a_sound_tile() -> None:
         _with(tile, voxel=-outside),
         _with(tile, sums=np.full((4, 4), np.nan, np.float32)),
         _with(tile, source=np.full(4, 3, np.int16)),
+        _with(tile, kind=np.full(4, 4, np.uint8)),
         tile._replace(kernels=dataclasses.replace(tile.kernels, level=np.full(3, 9, np.int8))),
         tile._replace(kernels=dataclasses.replace(tile.kernels, prior_var=np.zeros(3, np.float32))),
     ]

@@ -5,7 +5,21 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from potserver.numerics.evidence import add, cells, counts, decay, forget, is_alive, positions
+from potserver.numerics.evidence import (
+    FREE,
+    HIT,
+    LABELS,
+    NEAR,
+    SHADOW,
+    add,
+    cells,
+    clip_shadows,
+    counts,
+    decay,
+    forget,
+    is_alive,
+    positions,
+)
 from tests.numerics.evidence.samples import FINE_M, rows_of
 
 
@@ -38,7 +52,7 @@ def test_a_cell_is_a_free_voxel_and_the_hits_in_it() -> None:
 def test_looks_at_one_place_count_less_and_less(looks: int) -> None:
     points = np.tile([[0.1, 0.1, 0.1], [0.2, 0.2, 0.3]], (looks, 1))
     rows = rows_of(points, np.tile([True, False], looks))
-    count = counts(rows.sums, cells(rows), 20.0)
+    count = counts(rows, cells(rows), 20.0)
     np.testing.assert_allclose(count, looks / (1 + 2 * looks / 20.0), rtol=1e-5)
     assert count.sum() < 20.0
 
@@ -65,3 +79,31 @@ def test_cells_without_new_evidence_forget_nothing() -> None:
 def test_decay_scales_all() -> None:
     rows = rows_of([[0.1, 0.1, 0.1], [0.9, 0.1, 0.1]], [True, False])
     np.testing.assert_allclose(decay(rows, 0.5).sums, 0.5 * rows.sums)
+
+
+def test_kinds_have_rows_of_their_own_in_voxels_of_their_own() -> None:
+    points = np.tile([0.1, 0.1, 0.1], (4, 1))
+    kind = np.array([FREE, HIT, SHADOW, NEAR], np.uint8)
+    rows = rows_of(points, kind)
+    assert sorted(rows.kind.tolist()) == [FREE, HIT, SHADOW, NEAR]
+    assert rows.occupied.tolist() == [k == HIT for k in rows.kind]
+    assert rows.is_half.tolist() == [k in (HIT, NEAR) for k in rows.kind]
+    np.testing.assert_allclose(positions(rows, FINE_M), points, atol=1e-6)
+    assert LABELS[[FREE, HIT, SHADOW, NEAR]].tolist() == [0.0, 1.0, 0.5, 0.0]
+
+
+def test_a_shadow_counts_only_where_nobody_looked() -> None:
+    alone = rows_of([[0.1, 0.1, 0.1]], np.array([SHADOW], np.uint8))
+    assert 0.0 < counts(alone, cells(alone), 20.0)[0] < 0.2
+    seen = rows_of(np.tile([0.1, 0.1, 0.1], (2, 1)), np.array([SHADOW, FREE], np.uint8))
+    count = dict(zip(seen.kind.tolist(), counts(seen, cells(seen), 20.0).tolist(), strict=True))
+    assert count[SHADOW] == 0.0
+    assert count[FREE] == pytest.approx(1 / (1 + 1 / 20.0)), "a shadow takes nothing from what was seen"
+
+
+def test_a_shadow_weighs_one_look_however_often_it_falls() -> None:
+    rows = rows_of(np.tile([0.1, 0.1, 0.1], (9, 1)), np.full(9, SHADOW, np.uint8))
+    where = positions(rows, FINE_M)
+    clip_shadows(rows)
+    assert rows.sums[0, 3] == pytest.approx(1.0)
+    np.testing.assert_allclose(positions(rows, FINE_M), where, atol=1e-6)
