@@ -86,7 +86,8 @@ class FaceQuestions:
         """How a map does."""
         p = mapper.ask(self._points).mean.reshape(-1, len(self._before_m))
         over = p >= 0.5
-        early, missed = over[:, 0], ~over.any(axis=1)
+        early: Bool = np.asarray(over[:, 0])
+        missed: Bool = np.asarray(~over.any(axis=1))
         after = np.maximum(over.argmax(axis=1), 1)
         rows = np.arange(len(p))
         below, above = p[rows, after - 1], p[rows, after]

@@ -19,6 +19,7 @@ _GAP_RAD = np.radians(0.05)  # between the elevations of two rings, at least
 _BACK_RAD = np.pi  # a step back in azimuth by more than this begins a new ring
 _FEWEST, _MOST = 4, 256
 _LEAST_BEAMS = 8  # of a ring, on average
+_LARGEST = 3.0  # a ring's beams over those of the average one
 
 
 class LeftOutRings:
@@ -53,10 +54,17 @@ def ring_numbers(scan: RecordedScan) -> Int64:
     x, y, z = scan.points.astype(np.float64).T
     azimuth = np.arctan2(y, x)
     if scan.is_planar:
-        return np.floor((azimuth + np.pi) / SECTOR_RAD).astype(np.int64)
-    for rings in (_by_elevation(np.arctan2(z, np.hypot(x, y))), _by_order(azimuth)):
-        n = int(rings.max(initial=0)) + 1
-        if _FEWEST <= n <= min(_MOST, len(rings) // _LEAST_BEAMS):
+        sectors: Int64 = np.floor((azimuth + np.pi) / SECTOR_RAD).astype(np.int64)
+        return sectors
+    ways: list[Int64] = []
+    if len(azimuth) > 1:
+        ways = [_by_elevation(np.arctan2(z, np.hypot(x, y))), _by_order(azimuth)]
+    for rings in ways:
+        sizes = np.bincount(rings)
+        if (
+            _FEWEST <= len(sizes) <= min(_MOST, len(rings) // _LEAST_BEAMS)
+            and sizes.max() <= _LARGEST * sizes.mean()
+        ):
             return rings
     raise SettingsError(f"{scan.name}: no rings can be told apart, by elevation or by the order of the beams")
 
@@ -69,7 +77,9 @@ def _by_elevation(elevation: Float64) -> Int64:
 
 
 def _by_order(azimuth: Float64) -> Int64:
-    turned = np.mod(azimuth, 2 * np.pi)
-    step = np.diff(turned, prepend=turned[:1])
+    step = (np.diff(azimuth) + np.pi) % (2 * np.pi) - np.pi
     onwards = -1.0 if np.median(step) < 0 else 1.0
-    return np.asarray(np.cumsum(onwards * step < -_BACK_RAD))
+    seam = np.median(np.abs(step)) / 2  # before the azimuth of the first beam: rings begin at about that
+    turned = (onwards * (azimuth - azimuth[0]) + seam) % (2 * np.pi)
+    rings: Int64 = np.cumsum(np.diff(turned, prepend=turned[:1]) < -_BACK_RAD)
+    return rings
