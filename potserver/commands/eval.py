@@ -43,11 +43,12 @@ _ABOUT = """\
 Measure maps on beams that they never saw: a fifth of each scan's beams is kept back, all scans go through the map scan
 by scan, and then it is asked about those beams' ends (occupied) and points before them (free), near the ends too.
 
-The headline is (H + N) / 2. H: NLL of the ends and a point at least 0.5 m before each, by protocol 1. N: NLL of the ends and a
-point 0.05 to 0.5 m before each, on beams that meet their surface at less than 60 degrees. Thick walls help H and harm N.
+The headline is (H + N) / 2. H: NLL of the ends and a point at least 0.5 m before each, by protocol 1. N: NLL of the
+ends and a point 0.05 to 0.5 m before each, on beams that meet their surface at less than 60 degrees. Thick walls help H
+and harm N.
 
-Towns and the gauntlet (doorways, poles and wires) are asked about their exact truth too. Times are of maps that take turns,
-scan by scan, in this process.
+Towns and the gauntlet (doorways, poles and wires) are asked about their exact truth too. Times are of maps that take
+turns, scan by scan, in this process.
 --peers needs `pip install 'potserver[peers]'` for OctoMap."""
 
 _EXAMPLES = """\
