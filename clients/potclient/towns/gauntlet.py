@@ -21,7 +21,7 @@ N_SCANS = 20
 _WALL_M, _WALL_TOP_M = 0.2, 2.4  # thickness and height of the walls with openings
 _SLICE_M, _SENSOR_M = 0.7, 1.73  # height of a planar scanner, and of another
 _HALF_WAY_M, _HALF_WALL_M = 9.0, 9.0
-_YARD_M = (14.0, 12.0, 3.0)  # half the length, half the width, and the height of the walls around all
+_YARD_M = ((-14.1, -10.7, 0.0), (14.1, 8.2, 3.0))  # lower and upper corner of the walls around all
 
 
 class Opening(NamedTuple):
@@ -129,11 +129,14 @@ def _parts() -> list[Part]:
         r = diameter_m / 2
         lower, upper = (-WIRE_HALF_M, y_m - r, z_m - r), (WIRE_HALF_M, y_m + r, z_m + r)
         parts.append(box(lower, upper, Kind.POLE))
-    long, wide, top = _YARD_M
-    for side in (-1.0, 1.0):
-        x, y = side * long, side * wide
-        parts.append(box((x - 0.1, -wide, 0.0), (x + 0.1, wide, top), Kind.BUILDING))
-        parts.append(box((-long, y - 0.1, 0.0), (long, y + 0.1, top), Kind.BUILDING))
+    (x0, y0, z0), (x1, y1, z1) = _YARD_M
+    for lower, upper in (
+        ((x0, y0, z0), (x0 + _WALL_M, y1, z1)),
+        ((x1 - _WALL_M, y0, z0), (x1, y1, z1)),
+        ((x0, y0, z0), (x1, y0 + _WALL_M, z1)),
+        ((x0, y1 - _WALL_M, z0), (x1, y1, z1)),
+    ):
+        parts.append(box(lower, upper, Kind.BUILDING))
     return parts
 
 
