@@ -65,7 +65,10 @@ def main() -> int:
         hold_out=HoldOut(0.2), thin=options.thin, on_step=lambda step: print(step, file=sys.stderr),
     )  # fmt: skip
     points = [
-        Point(curve, steps, float(np.median(row.cpu_ms)), row.held_out.auc, row.held_out.nll, row.held_out.ece, row.size.cells)
+        Point(
+            curve, steps, float(np.median(row.cpu_ms)), row.protocol_1.held_out.auc, row.protocol_1.held_out.nll,
+            row.protocol_1.held_out.ece, row.size.cells,
+        )
         for (curve, steps), row in zip(names, evaluation.rows, strict=True)
     ]  # fmt: skip
     console.print(f"{evaluation.n_scans} scans, {evaluation.n_beams:,} beams mapped")

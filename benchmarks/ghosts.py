@@ -128,10 +128,8 @@ def _follow(
         places = _followed(places, recording.town, scan)
         chosen = places.take(places.left & ((places.n_occupied >= _SCANS_STOOD) == (kind == _STOOD)))
         for a_map in maps:
-            p, known = a_map.occupancy(chosen.points)
-            np.add.at(
-                sums[a_map.name], chosen.n_through, np.stack([np.where(known, p, 0.5), np.ones(len(p))], 1)
-            )
+            p = a_map.ask(chosen.points).mean
+            np.add.at(sums[a_map.name], chosen.n_through, np.stack([p, np.ones(len(p))], 1))
         places = places.add(*_on_movers(recording.town, scan, rng))
     means = {name: (s[:, 0] / np.maximum(s[:, 1], 1)).tolist() for name, s in sums.items()}
     return means, next(iter(sums.values()))[:, 1].astype(int).tolist()

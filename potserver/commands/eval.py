@@ -11,13 +11,12 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from potclient.datasets import FORMATS, FRAMES
 from potclient.errors import DatasetError, UsageError
 from potclient.holdout import HoldOut
 from potschemas import __version__
 from potserver import bundled
+from potserver.commands.eval_tables import tables_of
 from potserver.commands.shared import (
     EXIT_OK,
     add_mapping_flags,
@@ -37,14 +36,19 @@ if TYPE_CHECKING:
     from potserver.config import Settings
     from potserver.domain.dictionary import AtomDictionary
     from potserver.evaluation.mappers import Mapper
-    from potserver.evaluation.protocol import Evaluation, Row
+    from potserver.evaluation.protocol import Evaluation
     from potserver.mapping.settings import MappingSettings
 
 _ABOUT = """\
 Measure maps on beams that they never saw: a fifth of each scan's beams is kept back, all scans go through the map scan
-by scan, and then it is asked about those beams' ends (occupied) and one point before each (free).
+by scan, and then it is asked about those beams' ends (occupied) and points before them (free), near the ends too.
 
-Towns are asked about their exact truth too. Times are of maps that take turns, scan by scan, in this process.
+The headline is (H + N) / 2. H: NLL of the ends and a point at least 0.5 m before each, by protocol 1. N: NLL of the
+ends and a point 0.05 to 0.5 m before each, on beams that meet their surface at less than 60 degrees. Thick walls help H
+and harm N.
+
+Towns and the gauntlet (doorways, poles and wires) are asked about their exact truth too. Times are of maps that take
+turns, scan by scan, in this process.
 --peers needs `pip install 'potserver[peers]'` for OctoMap."""
 
 _EXAMPLES = """\
@@ -53,12 +57,10 @@ examples:
   potserver eval /data/kitti/00 --scans 20 --max-range 25 --peers octomap:0.1,octomap:0.2,bgk:0.2,grid
   potserver eval town:terraces:dynamic:7 --scans 25 --max-range 25 --ablations --json out/town.json
   potserver eval town:suburb:7 --profile paper --set mapping.max_range_m=15
+  potserver eval gauntlet:vlp16 --peers octomap:0.05
+  potserver eval /data/kitti/00 --scans 1 --rings 4
   potserver eval bundled:rooms --peers grid"""
 
-_HELD_OUT = (
-    "map", "kernels", "bytes", "ms/scan", "[range]", "CPU ms", "ACC", "AUC", "NLL", "Brier", "ECE", "unknown",
-)  # fmt: skip
-_TRUTH = {"uniform": "uniform", "near_surfaces": "near surfaces"}
 _COLUMNS = 160  # of the tables in a pipe
 
 
@@ -94,6 +96,12 @@ def add(commands: Any) -> None:
 
 def _add_beam_flags(beams: Any) -> None:
     beams.add_argument("--hold-out", type=float, default=0.2, metavar="SHARE", help="of the beams [0.2]")
+    beams.add_argument(
+        "--rings",
+        type=positive_int,
+        metavar="N",
+        help="leave every Nth ring out of every scan, and score it apart (2D: every Nth sector of 5 degrees)",
+    )
     beams.add_argument(
         "--scans", default=":", metavar="N", help="the first N of each recording, or START:STOP:STEP [all]"
     )
@@ -150,6 +158,7 @@ def _evaluate(
     from potserver.evaluation.mappers import ServiceMap
     from potserver.evaluation.peers import peer_named
     from potserver.evaluation.protocol import evaluate
+    from potserver.evaluation.rings import LeftOutRings
     from potserver.mapping.service import MakePipeline, MappingService, pipeline_of
     from potserver.recordings import Reader, open_recording, scan_numbers
 
@@ -182,6 +191,7 @@ def _evaluate(
             numbers,
             maps,
             hold_out=HoldOut(options.hold_out),
+            left_out=None if options.rings is None else LeftOutRings(options.rings),
             thin=options.thin,
             on_step=on_step,
         )
@@ -211,7 +221,8 @@ def _progress(dataset: str, steps: int) -> Iterator[Callable[[str], None]]:
 
 def _print(evaluation: Evaluation, console: Console, mapping: MappingSettings) -> None:
     console.print(f"\n[bold]{_title(evaluation)}[/bold]")
-    for heads, lines in _tables(evaluation):
+    for name, heads, lines in tables_of(evaluation):
+        console.print(name)
         console.print(table(heads, lines))
     if evaluation.reach_m > mapping.max_range_m * 1.001:
         console.print(
@@ -231,7 +242,8 @@ def to_markdown(evaluations: Sequence[Evaluation]) -> str:
     parts = []
     for evaluation in evaluations:
         parts.append(f"**{_title(evaluation)}**\n")
-        for heads, lines in _tables(evaluation):
+        for name, heads, lines in tables_of(evaluation):
+            parts.append(f"{name}\n")
             rows = [heads, ["---"] * len(heads), *lines]
             parts.append("\n".join(f"| {' | '.join(row)} |" for row in rows) + "\n")
     return "\n".join(parts)
@@ -240,46 +252,8 @@ def to_markdown(evaluations: Sequence[Evaluation]) -> str:
 def _title(evaluation: Evaluation) -> str:
     return (
         f"{evaluation.dataset}: {evaluation.n_scans} scans, {evaluation.n_beams:,} beams mapped, "
-        f"{evaluation.rows[0].held_out.n:,} held-out points, {evaluation.path_m:.0f} m of way"
+        f"{evaluation.rows[0].scores.protocol_1.held_out.n:,} held-out points, {evaluation.path_m:.0f} m of way"
     )
-
-
-def _tables(evaluation: Evaluation) -> Iterator[tuple[list[str], list[list[str]]]]:
-    """Heads and rows: the held-out points; then what only some maps or datasets have."""
-    yield list(_HELD_OUT), [_held_out_cells(row) for row in evaluation.rows]
-    truths = list(evaluation.rows[0].truth)
-    heads = ["map"]
-    for name in truths:
-        heads += [f"{_TRUTH[name]}: ACC", "AUC", "NLL", "unknown"]
-    heads += ["P(return) of beams without one", "range error, m"]
-    lines = []
-    for row in evaluation.rows:
-        cells = [row.name]
-        for name in truths:
-            m = row.truth[name]
-            cells += [f"{m.accuracy:.3f}", f"{m.auc:.4f}", f"{m.nll:.3f}", f"{m.share_unknown:.1%}"]
-        if row.rays is not None:
-            cells += [_number(row.rays.false_return), _number(row.rays.range_error_m)]
-        elif truths:
-            cells += ["-", "-"]
-        else:
-            continue
-        lines.append(cells)
-    if lines:
-        yield heads, lines
-
-
-def _held_out_cells(row: Row) -> list[str]:
-    m = row.held_out
-    spread = "batch" if row.is_batch else f"[{min(row.scan_ms):.0f}-{max(row.scan_ms):.0f}]"
-    times = [f"{np.median(row.scan_ms):.0f}", spread, f"{np.median(row.cpu_ms):.0f}"]
-    scores = [f"{m.accuracy:.3f}", f"{m.auc:.4f}", f"{m.nll:.3f}", f"{m.brier:.3f}", f"{m.ece:.3f}"]
-    size = [f"{row.size.cells:,}", f"{row.size.n_bytes:,}"]
-    return [row.name, *size, *times, *scores, f"{m.share_unknown:.1%}"]
-
-
-def _number(value: float) -> str:
-    return "-" if np.isnan(value) else f"{value:.2f}"
 
 
 def _machine(threads: int) -> str:

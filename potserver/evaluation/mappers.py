@@ -17,6 +17,17 @@ from potserver.recordings import to_scan
 _NUMBERS_A_KERNEL = 10  # position, its variances, gamma's shape and rate, the weight and its variance
 
 
+_POINTS_AT_A_TIME = 200_000
+
+
+class Answer(NamedTuple):
+    """What a map says at N points."""
+
+    mean: Float64  # (N,) P(occupied)
+    observed: Bool  # (N,) false: the map does not know
+    var: Float64 | None = None  # (N,) of that probability; None: the map has none
+
+
 class Size(NamedTuple):
     """How large a map is."""
 
@@ -46,8 +57,16 @@ class Mapper(ABC):
         """
 
     @abstractmethod
-    def occupancy(self, points: Float64) -> tuple[Float64, Bool]:
-        """(N,) P(occupied) and (N,) whether the map knows, at (N, 3) points, m, map frame."""
+    def occupancy(self, points: Float64) -> Answer:
+        """What the map says at (N, 3) points, m, map frame."""
+
+    def ask(self, points: Float64) -> Answer:
+        """As `occupancy`, for any number of points; where the map does not know, its mean counts as 0.5."""
+        starts = range(0, max(len(points), 1), _POINTS_AT_A_TIME)
+        parts = [self.occupancy(np.ascontiguousarray(points[k : k + _POINTS_AT_A_TIME])) for k in starts]
+        mean, observed = (np.concatenate([part[k] for part in parts]) for k in range(2))
+        var = [part.var for part in parts if part.var is not None]
+        return Answer(np.where(observed, mean, 0.5), observed, np.concatenate(var) if var else None)
 
     @abstractmethod
     def size(self) -> Size:
@@ -79,9 +98,9 @@ class ServiceMap(Mapper):
         self._n_scans += 1
         return update.timings_ms
 
-    def occupancy(self, points: Float64) -> tuple[Float64, Bool]:
+    def occupancy(self, points: Float64) -> Answer:
         answer = self.kernel_map.occupancy(points)
-        return answer.mean, answer.observed
+        return Answer(answer.mean, answer.observed, answer.var)
 
     def size(self) -> Size:
         return Size(len(self.kernel_map), kernel_bytes(self.kernel_map.kernels))

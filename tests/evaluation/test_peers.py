@@ -53,7 +53,7 @@ def octomap() -> OctoMap:
 
 
 def at(a_map: OctoMap | BgkMap, *point: float) -> float:
-    mean, known = a_map.occupancy(np.array([point]))
+    mean, known, _ = a_map.occupancy(np.array([point]))
     return float(mean[0]) if known[0] else math.nan
 
 
@@ -103,7 +103,7 @@ def test_octomap_is_what_its_library_makes_of_the_same_points() -> None:
         ours.integrate(whole)
         theirs.insertPointCloud(whole.in_map, whole.T_map_sensor[:3, 3].copy(), -1.0, False, True)
     points = rng.uniform(-4, 4, (500, 3))
-    mean, known = ours.occupancy(points)
+    mean, known, _ = ours.occupancy(points)
     assert known.any()
     assert not known.all()
     for point, p, is_known in zip(points, mean, known, strict=True):
@@ -159,7 +159,7 @@ def test_bgk_keeps_its_counts_as_it_grows() -> None:
     a_map = BgkMap(0.1)
     for part in np.array_split(ends, 3):
         a_map.integrate(scan(part.tolist()))
-    mean, known = a_map.occupancy(ends)
+    mean, known, _ = a_map.occupancy(ends)
     assert a_map.size().cells > 1 << 15
     assert known.all()
     assert np.median(mean) > 0.9
@@ -180,7 +180,7 @@ def test_the_grid_has_as_many_kernels_as_asked_for_and_knows_what_it_saw() -> No
     grid.integrate(scan(wall.tolist()))
     grid.finish(300)
     assert 200 < grid.size().cells <= 300
-    mean, known = grid.occupancy(np.array([[3.0, 0.5, 0.5], [1.5, 0.0, 0.0], [50.0, 0.0, 0.0]]))
+    mean, known, _ = grid.occupancy(np.array([[3.0, 0.5, 0.5], [1.5, 0.0, 0.0], [50.0, 0.0, 0.0]]))
     assert mean[0] > 0.8
     assert mean[1] < 0.2
     assert known.tolist() == [True, True, False]
@@ -192,7 +192,7 @@ def test_the_grid_samples_all_scans_alike() -> None:
         ends = np.column_stack([np.full(500, side), np.zeros((500, 2))])
         grid.integrate(scan(ends.tolist()))
     grid.finish(20)
-    mean, _ = grid.occupancy(np.array([[-3.0, 0.0, 0.0], [3.0, 0.0, 0.0]]))
+    mean, _, _ = grid.occupancy(np.array([[-3.0, 0.0, 0.0], [3.0, 0.0, 0.0]]))
     assert (mean > 0.6).all()
 
 

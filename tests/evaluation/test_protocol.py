@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 from pathlib import Path
 
@@ -15,7 +16,7 @@ from potserver.commands.eval import to_markdown
 from potserver.domain.kernel_map import KernelMap
 from potserver.errors import EmptyError
 from potserver.evaluation.ablations import ABLATIONS, label_of
-from potserver.evaluation.mappers import Mapper, ServiceMap, Size, kernel_bytes
+from potserver.evaluation.mappers import Answer, Mapper, ServiceMap, Size, kernel_bytes
 from potserver.evaluation.protocol import evaluate
 from potserver.recordings import to_scan
 
@@ -63,9 +64,9 @@ class Oracle(Mapper):
     def finish(self, n_kernels: int) -> None:
         self.given = n_kernels
 
-    def occupancy(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        at_wall = points[:, 0] > WALL_M - 0.25
-        return np.where(at_wall, self._p, 1.0 - self._p), np.full(len(points), self._known)
+    def occupancy(self, points: np.ndarray) -> Answer:
+        at_wall = points[:, 0] > WALL_M - 1e-3
+        return Answer(np.where(at_wall, self._p, 1.0 - self._p), np.full(len(points), self._known))
 
     def size(self) -> Size:
         return Size(17, 1700)
@@ -78,7 +79,7 @@ class Batch(Oracle):
 def test_a_map_that_knows_the_truth_scores_perfectly_and_one_that_knows_nothing_scores_a_half() -> None:
     right, ignorant = Oracle(), Oracle(known=False, name="ignorant")
     found = evaluate("wall", Wall(), range(3), [right, ignorant], hold_out=HoldOut())
-    best, worst = (row.held_out for row in found.rows)
+    best, worst = (row.scores.protocol_1.held_out for row in found.rows)
     assert (best.accuracy, best.auc, best.share_unknown) == (1.0, 1.0, 0.0)
     assert best.nll == pytest.approx(1e-6, rel=1e-3)
     assert (worst.auc, worst.share_unknown) == (0.5, 1.0)
@@ -97,7 +98,7 @@ def test_no_map_is_given_a_beam_that_it_is_asked_about() -> None:
         n_asked += int(
             held.sum() + (held & whole.is_return).sum()
         )  # a free point each, and an end where there is an echo
-    assert found.rows[0].held_out.n == n_asked
+    assert found.rows[0].scores.protocol_1.held_out.n == n_asked
     assert found.n_beams == sum(map(len, oracle.scans))
 
 
@@ -156,7 +157,9 @@ class Solid(Oracle):
 
 def test_rays_are_scored_by_where_held_out_beams_ended() -> None:
     maps = [Solid(), Solid(WALL_M - 1.0)]
-    right, short = (row.rays for row in evaluate("wall", Wall(), range(3), maps, hold_out=HoldOut()).rows)
+    right, short = (
+        row.scores.rays for row in evaluate("wall", Wall(), range(3), maps, hold_out=HoldOut()).rows
+    )
     assert right is not None
     assert short is not None
     assert 0 < right.n_free < right.n_returns
@@ -168,7 +171,7 @@ def test_rays_are_scored_by_where_held_out_beams_ended() -> None:
 
 
 def test_maps_without_kernels_are_asked_for_no_rays() -> None:
-    assert evaluate("wall", Wall(), range(1), [Oracle()], hold_out=HoldOut()).rows[0].rays is None
+    assert evaluate("wall", Wall(), range(1), [Oracle()], hold_out=HoldOut()).rows[0].scores.rays is None
 
 
 def test_towns_are_asked_about_their_truth() -> None:
@@ -177,14 +180,13 @@ def test_towns_are_asked_about_their_truth() -> None:
     town = recording.town
 
     class Truth(Oracle):
-        def occupancy(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-            return town.occupied(points, recording[4].stamp_ns / 1e9).astype(float), np.ones(
-                len(points), bool
-            )
+        def occupancy(self, points: np.ndarray) -> Answer:
+            occupied = town.occupied(points, recording[4].stamp_ns / 1e9)
+            return Answer(occupied.astype(float), np.ones(len(points), bool))
 
     found = evaluate("town", recording, [0, 4], [Truth()], hold_out=HoldOut())
-    assert set(found.rows[0].truth) == {"uniform", "near_surfaces"}
-    for metrics in found.rows[0].truth.values():
+    assert set(found.rows[0].scores.protocol_1.truth) == {"uniform", "near_surfaces"}
+    for metrics in found.rows[0].scores.protocol_1.truth.values():
         assert metrics.accuracy == metrics.auc == 1.0
         assert metrics.n > 30
 
@@ -225,10 +227,14 @@ def test_our_map_is_the_services() -> None:
     size = service.size()
     assert size.cells == len(service.kernel_map) > 0
     assert size.n_bytes == kernel_bytes(service.kernel_map.kernels) == 40 * size.cells
-    mean, observed = service.occupancy(np.array([[WALL_M, 0.0, 0.0], [2.0, 0.0, 0.0], [500.0, 0.0, 0.0]]))
+    mean, observed, var = service.occupancy(
+        np.array([[WALL_M, 0.0, 0.0], [2.0, 0.0, 0.0], [500.0, 0.0, 0.0]])
+    )
     assert mean[0] > 0.8
     assert mean[1] < 0.2
     assert observed.tolist() == [True, True, False]
+    assert var is not None
+    assert var[2] > var[0]
 
 
 # --- the command ---------------------------------------------------------------------------------------------------------
@@ -262,13 +268,14 @@ def test_the_command_prints_a_row_a_map_and_writes_all_numbers(
     assert report["options"]["thin"] == 8
     assert "1 threads" in report["machine"]
     for row in rows:
-        line = next(line for line in text.splitlines() if line.startswith(row["name"]))
-        assert f"{row['held_out']['auc']:.4f}" in line
+        lines = [line for line in text.splitlines() if line.startswith(row["name"])]
+        for metrics in (row["beams"]["metrics"], row["protocol_1"]["held_out"]):
+            assert any(f"{metrics['auc']:.4f}" in line for line in lines)
+            assert 0.5 < metrics["auc"] <= 1.0
         assert len(row["scan_ms"]) == 2
-        assert 0.5 < row["held_out"]["auc"] <= 1.0
     assert rows[2]["cells"] == pytest.approx(rows[0]["cells"], rel=0.1)
     assert "label" in text  # the stages of ours
-    assert f"| {rows[0]['held_out']['auc']:.4f} |" in document.read_text()
+    assert f"| {rows[0]['beams']['metrics']['auc']:.4f} |" in document.read_text()
 
 
 def test_held_out_beams_beyond_the_maps_reach_are_pointed_out(capsys: pytest.CaptureFixture[str]) -> None:
@@ -280,10 +287,13 @@ def test_held_out_beams_beyond_the_maps_reach_are_pointed_out(capsys: pytest.Cap
 
 def test_tables_of_a_document_have_as_many_cells_as_heads() -> None:
     lines = to_markdown([evaluate("wall", Wall(), range(2), [Solid()], hold_out=HoldOut())]).splitlines()
-    tables = [line for line in lines if line.startswith("|")]
-    assert {line.count("|") for line in tables[:3]} == {13}
-    assert {line.count("|") for line in tables[3:]} == {4}
-    assert len(tables) == 6
+    tables = [
+        [line.count("|") for line in block]
+        for is_table, block in itertools.groupby(lines, lambda line: line.startswith("|"))
+        if is_table
+    ]
+    assert [len(table) for table in tables] == [3, 3, 3, 3, 3]  # cost, beams, near, rays, protocol 1
+    assert [set(table) for table in tables] == [{7}, {11}, {9}, {4}, {8}]
 
 
 def test_bundled_recordings_are_measured_by_name(capsys: pytest.CaptureFixture[str]) -> None:

@@ -2,7 +2,8 @@
 
 Formats: `kitti` (odometry layout), `clouds` (a folder of PCD or PLY files with poses), `carmen` (2D laser logs), `generated`
 (a made-up yard; the path is `generated`, `generated:2d`, or either with `:SEED`), `town` (a drive through a made-up town, see
-`potclient.towns`; the path is `town:STYLE[:2d][:dynamic][:SENSOR][:LENGTHm][:SEED]`).
+`potclient.towns`; the path is `town:STYLE[:2d][:dynamic][:SENSOR][:LENGTHm][:SEED]`), `gauntlet` (doorways, poles and wires of
+known size; the path is `gauntlet[:SENSOR][:SEED]`).
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ __all__ = [
     "open_dataset",
 ]
 
-FORMATS = ("auto", "kitti", "clouds", "carmen", "generated", "town")
+FORMATS = ("auto", "kitti", "clouds", "carmen", "generated", "town", "gauntlet")
 
 
 def open_dataset(
@@ -43,7 +44,8 @@ def open_dataset(
     """Open a recording; slice it to take fewer scans, e.g. `open_dataset(path)[::2]`.
 
     Args:
-        path: A folder or file, `generated[:2d][:SEED]`, or `town:STYLE[:2d][:dynamic][:SENSOR][:LENGTHm][:SEED]`.
+        path: A folder or file, `generated[:2d][:SEED]`, `town:STYLE[:2d][:dynamic][:SENSOR][:LENGTHm][:SEED]`, or
+            `gauntlet[:SENSOR][:SEED]`.
         format: One of `FORMATS`; "auto" looks at what is there.
         poses: Pose file to use instead of the usual one.
         frame: For PCD files: where their points are, see `CloudFolder`.
@@ -68,6 +70,10 @@ def open_dataset(
         from potclient.towns import open_town
 
         return open_town(str(path), n_scans=n_generated, min_range_m=min_range_m, max_range_m=max_range_m)
+    if format == "gauntlet" or (format == "auto" and str(path).partition(":")[0] == "gauntlet"):
+        from potclient.towns import open_gauntlet
+
+        return open_gauntlet(str(path), min_range_m=min_range_m, max_range_m=max_range_m)
     path = Path(path)
     if not path.exists():
         raise DatasetError(f"{path}: no such file or folder")

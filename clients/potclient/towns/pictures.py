@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 from potclient.arrays import Float64
 from potclient.pictures import load_pyplot
 from potclient.towns.raycast import RayScene
-from potclient.towns.recording import PERIOD_S, TownRecording, open_town
+from potclient.towns.recording import TownRecording, open_town
 from potclient.towns.solids import Kind, SolidSet
+from potclient.towns.surveyed import PERIOD_S
 from potclient.towns.town import Town
 
 _COLOURS = {

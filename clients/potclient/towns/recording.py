@@ -8,18 +8,19 @@ from pathlib import Path
 from typing import overload
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from potclient.arrays import Float64
-from potclient.datasets.scans import RecordedScan, Recording
+from potclient.arrays import Bool, Float64
+from potclient.datasets.scans import RecordedScan
 from potclient.errors import DatasetError
 from potclient.towns.lidar import SENSORS, Lidar
-from potclient.towns.raycast import RayScene, require
+from potclient.towns.raycast import RayScene
 from potclient.towns.solids import SolidSet
-from potclient.towns.streets import Crossing, stream
+from potclient.towns.streets import Crossing
 from potclient.towns.styles import STYLES
+from potclient.towns.surveyed import PERIOD_S, Surfaces, SurveyedRecording
 from potclient.towns.town import Town
 
-PERIOD_S = 0.1  # of scans
 _KEPT_SCENES = 3
 
 
@@ -74,11 +75,8 @@ class TownName:
         return ":".join([*words, str(self.seed)])
 
 
-class TownRecording(Recording):
+class TownRecording(SurveyedRecording):
     """Scans of a drive through a town at 10 Hz; a slice is such a recording too.
-
-    Scan k is taken at `stamp_ns` = k * 0.1 s of the town's clock, so `town.occupied(points, scan.stamp_ns / 1e9)` is the truth
-    of that moment. Every scan has random numbers of its own: the order of reading does not matter.
 
     Args:
         town: Where to drive.
@@ -92,22 +90,22 @@ class TownRecording(Recording):
     format = "town"
 
     def __init__(self, town: Town, lidar: Lidar, indices: range, name: str | None = None) -> None:
-        require()
-        if lidar.is_planar != (town.slice_m is not None):
-            raise DatasetError(f"sensor {lidar.name}: a planar scanner is for 2D towns, and only that")
         style = town.style
-        super().__init__(Path(name or f"town:{style.name}:{town.seed}"))
-        self.town, self.lidar, self.indices = town, lidar, indices
-        self._directions = lidar.directions()
+        super().__init__(
+            Path(name or f"town:{style.name}:{town.seed}"),
+            lidar,
+            indices,
+            seed=town.seed,
+            slice_m=town.slice_m,
+            ceiling_m=style.ceiling_m,
+        )
+        self.town = town
         self._scenes: dict[Crossing, RayScene] = {}
         spacing = style.speed_m_s * PERIOD_S * indices.step
         self.notes = (
             f"made-up town: {style.summary}; seed {town.seed}, {'dynamic' if town.dynamic else 'static'}",
             f"{lidar.name} every {spacing:.3g} m at {style.speed_m_s:g} m/s",
         )
-
-    def __len__(self) -> int:
-        return len(self.indices)
 
     @overload
     def __getitem__(self, index: int) -> RecordedScan: ...
@@ -118,31 +116,13 @@ class TownRecording(Recording):
             return TownRecording(self.town, self.lidar, self.indices[index], str(self.path))
         return super().__getitem__(index)
 
-    def read(self, i: int) -> RecordedScan:
-        k = self.indices[i]
-        time_s = k * PERIOD_S
-        town, lidar = self.town, self.lidar
-        pose = town.pose(time_s)
-        eye = pose[:3, 3].copy()
-        if town.slice_m is not None:
-            eye[2] = town.slice_m
-        range_m = self._cast(eye, self._directions @ pose[:3, :3].T, time_s)
-        rng = stream(town.seed, 9, k)
-        is_return = range_m < lidar.max_range_m
-        noise = rng.normal(0.0, lidar.noise_m, len(range_m)) if lidar.noise_m else 0.0
-        measured = np.where(is_return, np.minimum(range_m + noise, lidar.max_range_m), lidar.max_range_m)
-        kept = (range_m >= lidar.min_range_m) & (measured > 0) & (rng.random(len(range_m)) >= lidar.dropout)
-        return RecordedScan(
-            points=(self._directions[kept] * measured[kept, None]).astype(np.float32),
-            is_return=is_return[kept],
-            T_map_sensor=pose,
-            stamp_ns=round(time_s * 1e9),
-            name=f"{self.path}#{k}",
-            is_planar=lidar.is_planar,
-        )
+    def pose(self, time_s: float) -> Float64:
+        return self.town.pose(time_s)
 
-    def _cast(self, eye: Float64, directions: Float64, time_s: float) -> Float64:
-        """(N,) m to the first surface; inf if there is none in reach."""
+    def occupied(self, points: ArrayLike, time_s: float = 0.0) -> Bool:
+        return self.town.occupied(points, time_s)
+
+    def solid_surfaces(self, eye: Float64, directions: Float64, time_s: float) -> Surfaces:
         town, reach = self.town, self.lidar.max_range_m
         i, j = town.grid.cell(eye[None, :2])[0]
         cell = (int(i), int(j))
@@ -152,17 +132,13 @@ class TownRecording(Recording):
             self._scenes[cell] = RayScene([town.solids(c) for c in around], (lower + upper) / 2)
             if len(self._scenes) > _KEPT_SCENES:
                 del self._scenes[next(iter(self._scenes))]
-        range_m = self._scenes[cell].cast(eye, directions).range_m
+        range_m, _, normals = self._scenes[cell].cast(eye, directions)
         moving = SolidSet(town.moving(time_s, eye[:2] - reach, eye[:2] + reach))
         if len(moving):
-            range_m = np.minimum(range_m, RayScene([moving], eye[:2]).cast(eye, directions).range_m)
-        rise = directions[:, 2]
-        down = np.flatnonzero(rise < 0)
-        range_m[down] = np.minimum(range_m[down], -eye[2] / rise[down])
-        if town.style.ceiling_m is not None:
-            up = np.flatnonzero(rise > 0)
-            range_m[up] = np.minimum(range_m[up], (town.style.ceiling_m - eye[2]) / rise[up])
-        return range_m
+            mobile = RayScene([moving], eye[:2]).cast(eye, directions)
+            nearer = mobile.range_m < range_m
+            range_m[nearer], normals[nearer] = mobile.range_m[nearer], mobile.normals[nearer]
+        return Surfaces(range_m, normals.astype(np.float64))
 
 
 def open_town(

@@ -9,7 +9,7 @@ import numpy as np
 
 from potclient.arrays import Bool, Float64
 from potclient.datasets import RecordedScan
-from potserver.evaluation.mappers import Mapper, Size
+from potserver.evaluation.mappers import Answer, Mapper, Size
 from potserver.numerics.voxel_hash import empty_table, find, pack
 
 _SCALE = 1.0  # of the kernel
@@ -72,10 +72,10 @@ class BgkMap(Mapper):
             self._table = empty_table(len(self._keys))
             _enter(self._table, self._keys, self._n)
 
-    def occupancy(self, points: Float64) -> tuple[Float64, Bool]:
+    def occupancy(self, points: Float64) -> Answer:
         counts = _look_up(np.ascontiguousarray(points), self._edge_m, self._keys, self._counts, self._table)
         total = counts.sum(axis=1, dtype=np.float64)
-        return (counts[:, 1] + _PRIOR) / (total + 2 * _PRIOR), total > 0
+        return Answer((counts[:, 1] + _PRIOR) / (total + 2 * _PRIOR), total > 0)
 
     def size(self) -> Size:
         return Size(self._n, self._n * _BYTES_A_CELL)

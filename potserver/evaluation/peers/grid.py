@@ -6,12 +6,12 @@ import math
 
 import numpy as np
 
-from potclient.arrays import Bool, Float64
+from potclient.arrays import Float64
 from potclient.datasets import RecordedScan
 from potschemas.answers import AnswerRule
 from potserver.domain.kernel_map import KernelMap
 from potserver.domain.types import KernelSet
-from potserver.evaluation.mappers import Mapper, Size, kernel_bytes
+from potserver.evaluation.mappers import Answer, Mapper, Size, kernel_bytes
 from potserver.mapping.placing import kernels_at
 from potserver.numerics.feature_blocks import feature_blocks
 from potserver.numerics.lattice_nodes import new_nodes
@@ -84,9 +84,9 @@ class GridMap(Mapper):
             threads=self._threads,
         )
 
-    def occupancy(self, points: Float64) -> tuple[Float64, Bool]:
+    def occupancy(self, points: Float64) -> Answer:
         answer = self._map.occupancy(points)
-        return answer.mean, answer.observed
+        return Answer(answer.mean, answer.observed, answer.var)
 
     def size(self) -> Size:
         return Size(len(self._map), kernel_bytes(self._map.kernels))

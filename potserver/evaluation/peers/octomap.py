@@ -12,7 +12,7 @@ import numpy as np
 from potclient.arrays import Bool, Float64
 from potclient.datasets import RecordedScan
 from potserver.errors import SettingsError
-from potserver.evaluation.mappers import Mapper, Size
+from potserver.evaluation.mappers import Answer, Mapper, Size
 from potserver.numerics.geometry import voxel_pick
 
 _SAME_LENGTH = 1e-3  # relative
@@ -60,14 +60,14 @@ class OctoMap(Mapper):
         self._tree.insertPointCloud(ends[voxel_pick(ends, self._resolution_m)], origin, reach_m)
         return {}
 
-    def occupancy(self, points: Float64) -> tuple[Float64, Bool]:
+    def occupancy(self, points: Float64) -> Answer:
         probability, known = np.full(len(points), 0.5), np.zeros(len(points), np.bool_)
         search = self._tree.search
         for i, point in enumerate(np.ascontiguousarray(points, np.float64)):
             node = search(point)
             if node is not None:
                 probability[i], known[i] = node.getOccupancy(), True
-        return np.clip(probability, 0.0, 1.0), known
+        return Answer(np.clip(probability, 0.0, 1.0), known)
 
     def size(self) -> Size:
         with tempfile.TemporaryDirectory() as folder:
