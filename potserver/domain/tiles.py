@@ -118,7 +118,8 @@ class TileGrid(NamedTuple):
         pairs = max(1, round(size_m / (_VOXELS_OF_PAIR * fine_m)))
         if 2 * _VOXELS_OF_PAIR * pairs > 2**14:
             raise SettingsError(
-                f"mapping.tile_size_m is {size_m} with fine_m {fine_m}: at most {2**14} half voxels fit a tile; make it smaller"
+                f"mapping.tile_size_m is {size_m} with mapping.resolution_m {fine_m}: at most {2**14} half voxels fit a tile;"
+                " make it smaller"
             )
         return TileGrid(size_m, size_m / (_VOXELS_OF_PAIR * pairs))
 
@@ -225,7 +226,7 @@ class Region:
         if (max(b - a for a, b in zip(low, high, strict=True)) + 2) * 2 * grid.voxels >= CELL_LIMIT:
             raise SettingsError(
                 f"a scan spans {(upper_m - lower_m).round().tolist()} m, too far for voxels of {grid.fine_m:.3g} m: lower"
-                " mapping.max_range_m or raise mapping.fine_m"
+                " mapping.max_range_m or raise mapping.resolution_m"
             )
         axes = [range(a, b + 1) for a, b in zip(low, high, strict=True)]
         found = [(x, y, z) for x, y, z in itertools.product(*axes) if (x, y, z) in tiled.tiles]
@@ -235,7 +236,7 @@ class Region:
         kernels = MapKernels.concatenate([tile.kernels for tile in members])
         of_row = np.repeat(shift, [len(tile.rows.kind) for tile in members], axis=0)
         of_kernel = np.repeat(shift, [len(tile.kernels) for tile in members], axis=0)
-        edge = _tile_edge(rows, grid)
+        edge = voxels_along(rows, grid)
         return Region(
             grid=grid, lower=low, upper=high, kernels=kernels.moved(np.asarray(of_kernel * grid.size_m, np.float64)),
             rows=rows._replace(voxel=(rows.voxel + of_row * edge).astype(np.int32)),
@@ -276,8 +277,8 @@ class Region:
         return out
 
 
-def _tile_edge(rows: Rows, grid: TileGrid) -> NDArray[np.int64]:
-    """(R, 1) voxels along a tile's edge, for each row in its own kind of voxel."""
+def voxels_along(rows: Rows, grid: TileGrid) -> NDArray[np.int64]:
+    """(R, 1) voxels along a tile's edge, for each row in the voxels of its kind."""
     return np.where(rows.is_half, 2 * grid.voxels, grid.voxels)[:, None]
 
 

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from potserver.domain.tiles import CARRIED, MapKernels, Tile, TileGrid, TileIndex
+from potserver.domain.tiles import CARRIED, MapKernels, Tile, TileGrid, TileIndex, voxels_along
 from potserver.domain.types import KERNEL_ARRAYS, KernelSet
 from potserver.errors import MapFileError, ShapeError
 from potserver.numerics.evidence import LABELS, Rows
@@ -110,7 +110,7 @@ def decode_tile(data: bytes, grid: TileGrid, n_robots: int) -> tuple[TileIndex, 
 def _check(tile: Tile, grid: TileGrid, n_robots: int, index: TileIndex) -> None:
     """A sound checksum does not say who wrote the file."""
     rows, kernels = tile.rows, tile.kernels
-    edge = np.where(rows.is_half, 2 * grid.voxels, grid.voxels)[:, None]
+    edge = voxels_along(rows, grid)
     sound = (
         ((rows.voxel >= 0) & (rows.voxel < edge)).all()
         and (rows.kind < len(LABELS)).all()
