@@ -10,9 +10,15 @@ from typing import NamedTuple
 
 import numpy as np
 
+from potschemas.answers import AnswerRule
 from potserver.numerics import evidence, surface
 from potserver.numerics.arrays import Float32, Float64, UInt8
 from potserver.numerics.beams import Beams
+
+# A full lattice of kernels sums to an activation of 3.4 (in 2D 2.3), half of it to about half. With less than this a point lies
+# beyond the data: wide kernels reach it, and no evidence does.
+_OBSERVED_ACTIVATION = 0.8
+SHARP_RULE = AnswerRule(observed_activation=_OBSERVED_ACTIVATION, residual_var=50.0, mean_moderation=0.05)
 
 
 class SharpFaces(NamedTuple):

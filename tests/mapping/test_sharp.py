@@ -77,6 +77,21 @@ def test_behind_a_wall_nobody_is_sure() -> None:
     assert sharp.var[2] > 20.0 * default.var[2]
 
 
+def test_what_wide_kernels_reach_and_nobody_saw_is_unknown() -> None:
+    """Above the field of view, beside free space that was seen."""
+    free, above = np.array([[2.0, 0.0, 0.0], [3.0, 0.5, 0.3]]), np.array([[3.0, 0.0, 1.9], [3.5, 0.5, 2.1]])
+    observed = {}
+    for profile in ("default", "sharp"):
+        service = service_of(profile)
+        for k in range(3):
+            service.integrate(wall(5.0, seed=k))
+        answer = service.snapshot.occupancy(np.concatenate([free, above])).observed
+        observed[profile] = answer.tolist()
+    assert observed["sharp"] == [True, True, False, False]
+    assert observed["default"][:2] == [True, True]
+    assert any(observed["default"][2:])
+
+
 def test_the_rows_beside_faces_are_of_the_robot_that_saw_them() -> None:
     service = service_of("sharp")
     for robot, seed in (("a", 1), ("b", 2)):
