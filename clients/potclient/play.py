@@ -47,7 +47,7 @@ class PlayReport:
     elapsed_s: float
     held_out: Metrics | None = None
     n_held_out: int = 0  # labelled points; the score may be of a fixed-seed sample of them
-    failure: PotclientError | KeyboardInterrupt | None = None  # what ended it before the last scan
+    failure: PotclientError | KeyboardInterrupt | None = None  # what ended it early
 
     @property
     def all_accepted(self) -> bool:
@@ -129,9 +129,11 @@ def play(
     if hold_out is None or failure is not None:
         return report
     labels = LabelledPoints.concatenate(labelled)
-    return dataclasses.replace(
-        report, held_out=score_map(client, labels, max_test_points), n_held_out=len(labels)
-    )
+    report = dataclasses.replace(report, n_held_out=len(labels))
+    try:
+        return dataclasses.replace(report, held_out=score_map(client, labels, max_test_points))
+    except (PotclientError, KeyboardInterrupt) as error:  # the receipts are known all the same
+        return dataclasses.replace(report, failure=error)
 
 
 def score_map(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import threading
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -17,11 +18,12 @@ from potclient.cli import main
 from potclient.client import MapClient
 from potclient.errors import NoServerError
 from potclient.kernels import KernelSet
+from potschemas.messages import Cloud, ErrorCode, Receipt
 from potserver.server import MapServer
 
 from .conftest import DEADLINE_S
 from .rooms import pose, room
-from .scripted import ScriptedServer, free_port
+from .scripted import ScriptedServer, free_port, receipt_of
 
 Run = Callable[..., tuple[int, str, str]]
 CORNERS = ("--lower", "-2", "-2", "-2", "--upper", "2", "2", "2")
@@ -178,6 +180,76 @@ def test_publish_fails_if_a_scan_has_no_receipt(run_at: Run) -> None:
         )
     assert status == 1
     assert "2 unknown" in out
+
+
+@pytest.mark.parametrize("how", [[], ["--acknowledged"], ["--json", "-"]])
+def test_a_quiet_publish_still_says_why_scans_were_refused(run: Run, how: list[str]) -> None:
+    words = ("publish", "generated:2d", "--limit", "3", "--keep-stamps", "--robot", f"quiet{len(how)}", "-q")
+    status, _, err = run(*words)
+    assert status == 0
+    assert "not accepted" not in err
+    status, _, err = run(*words, *how)
+    assert status == 1
+    (line,) = [line for line in err.splitlines() if "not accepted" in line]
+    assert line.startswith("not accepted: 3 old_stamp (the stamp is ")
+
+
+@pytest.mark.parametrize("how", [[], ["--drop", "--rate", "50"]])
+def test_publish_ends_soon_after_its_server_died(
+    run_at: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, how: list[str]
+) -> None:
+    monkeypatch.setattr("potclient.commands.publish.GONE_S", 0.5)
+    target = tmp_path / "report.json"
+    server, n_clouds = ScriptedServer(), 0
+
+    def die_at_the_third(robot: str, cloud: Cloud) -> Receipt | None:
+        nonlocal n_clouds
+        n_clouds += 1
+        if n_clouds == 3:
+            threading.Thread(target=server.close).start()
+        return receipt_of(robot, cloud) if n_clouds < 3 else None
+
+    server.on_clouds(die_at_the_third)
+    started = time.monotonic()
+    words = ("publish", "generated:2d", "-q", "--hold-out", "0.2", "--json", str(target), *how)
+    status, out, err = run_at(server.endpoint, *words)
+    assert time.monotonic() - started < 10.0
+    assert status == 1
+    assert "the server is gone; waiting for it for 0.5 s" in err
+    assert re.search(r"the server was gone for 0\.5 s; \d+ of \d+ scans had been sent", err.splitlines()[-1])
+    assert re.search(r"^2 of \d+ scans accepted", out)
+    report = json.loads(target.read_text())
+    assert report["counts"]["accepted"] == 2
+    assert "the server was gone" in report["failure"]
+
+
+def test_publish_goes_on_when_its_server_is_back(run_at: Run) -> None:
+    with ScriptedServer() as server:
+
+        def leave_and_return(robot: str, cloud: Cloud) -> Receipt:
+            if server.n_left == 0:
+                server.leave()
+                threading.Timer(0.5, server.declare_ready).start()
+            return receipt_of(robot, cloud)
+
+        server.on_clouds(leave_and_return)
+        words = ("publish", "generated:2d", "--limit", "12", "--rate", "10")
+        status, out, err = run_at(server.endpoint, *words)
+    assert status == 0
+    assert "12 of 12 scans accepted" in out
+    assert err.index("the server is gone") < err.index("the server is back")
+
+
+def test_a_score_that_cannot_be_had_does_not_take_the_report_along(run_at: Run) -> None:
+    with ScriptedServer() as server:
+        server.on_clouds(receipt_of)
+        server.on("points", ErrorCode.INTERNAL)
+        status, out, err = run_at(
+            server.endpoint, "publish", "generated:2d", "--limit", "2", "--hold-out", "0.2"
+        )
+    assert status == 1
+    assert "2 of 2 scans accepted" in out
+    assert "internal" in err
 
 
 @pytest.mark.parametrize(("error", "status"), [(KeyboardInterrupt(), 130), (NoServerError("gone"), 1)])
