@@ -16,7 +16,7 @@ def add_pose_flag(parser: argparse.ArgumentParser) -> None:
         type=float,
         nargs=4,
         metavar=("X", "Y", "Z", "YAW"),
-        help="merge: where the origin of the map that is taken in lies in the other, m, and by how many degrees it is turned",
+        help="merge: where the origin of the map that is taken in lies in the other, m, and its yaw in degrees",
     )
 
 
