@@ -182,6 +182,18 @@ def test_publish_fails_if_a_scan_has_no_receipt(run_at: Run) -> None:
     assert "2 unknown" in out
 
 
+def test_held_out_beams_beyond_the_servers_range_are_told_with_the_flag_that_helps(run: Run) -> None:
+    words = ("publish", "generated", "--limit", "3", "--hold-out", "0.2", "-q", "--clear")
+    status, _, err = run(*words)
+    assert status == 0
+    (line,) = [line for line in err.splitlines() if "beyond" in line]
+    found = re.match(r"(\d+\.\d)% of the held-out beams end beyond the server's range of 12 m", line)
+    assert found is not None
+    assert 0.0 < float(found[1]) < 100.0
+    assert "--max-range 12" in line
+    assert "beyond" not in run(*words, "--max-range", "12")[2]
+
+
 @pytest.mark.parametrize("how", [[], ["--acknowledged"], ["--json", "-"]])
 def test_a_quiet_publish_still_says_why_scans_were_refused(run: Run, how: list[str]) -> None:
     words = ("publish", "generated:2d", "--limit", "3", "--keep-stamps", "--robot", f"quiet{len(how)}", "-q")
@@ -243,7 +255,7 @@ def test_publish_goes_on_when_its_server_is_back(run_at: Run) -> None:
 def test_a_score_that_cannot_be_had_does_not_take_the_report_along(run_at: Run) -> None:
     with ScriptedServer() as server:
         server.on_clouds(receipt_of)
-        server.on("points", ErrorCode.INTERNAL)
+        server.on("info", ErrorCode.INTERNAL)
         status, out, err = run_at(
             server.endpoint, "publish", "generated:2d", "--limit", "2", "--hold-out", "0.2"
         )
@@ -384,9 +396,15 @@ def test_info_and_atoms(run: Run, map_client: MapClient, tmp_path: Path) -> None
     status, out, _ = run("info", "--stats")
     assert status == 0
     assert re.search(r"^server +potserver$", out, re.MULTILINE)
-    assert "stats.uptime_s" in out
-    status, out, _ = run("info", "--json", "-")
-    assert json.loads(out)["server"] == "potserver"
+    assert re.search(r"^stats\.uptime_s +\d\d:\d\d:\d\d$", out, re.MULTILINE)
+    assert re.search(r"^started_ns +20\d\d-\d\d-\d\dT\d\d:\d\d:\d\dZ$", out, re.MULTILINE)
+    assert re.search(r"^stats\.rss_bytes +\d+\.\d [MG]iB$", out, re.MULTILINE)
+    assert re.search(r"^limits\.max_cloud_bytes +\d+\.\d MiB$", out, re.MULTILINE)
+    status, out, _ = run("info", "--stats", "--json", "-")
+    tree = json.loads(out)
+    assert tree["server"] == "potserver"
+    assert tree["started_ns"] > 10**18, "JSON keeps the numbers"
+    assert tree["stats"]["rss_bytes"] > 2**20
     listed = map_client.atoms()
     atom, n = listed[0].atom_id, len(listed)
     status, out, _ = run("atoms")

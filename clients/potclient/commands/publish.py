@@ -147,6 +147,12 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.json != "-":
         _say_play(report)
     _note_reasons(report)
+    if report.beyond_range > 0 and report.range_m is not None:
+        note(
+            f"{report.beyond_range:.1%} of the held-out beams end beyond the server's range of {report.range_m:g} m, where it"
+            f" maps nothing: cut them with --max-range {report.range_m:g}, or start the server with"
+            " --set mapping.max_range_m=METRES"
+        )
     if report.failure is not None:
         raise report.failure
     return EXIT_OK if report.all_accepted else EXIT_FAILED
