@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potclient.commands import export_flags, pose_flag
+from potclient.commands.output_files import file_in_new_folder
 from potclient.octomap import DEPTH, KEY_ORIGIN, Leaves, read_bt
 from potserver.commands.shared import (
     EXIT_OK,
@@ -124,7 +125,12 @@ def add(commands: Any) -> None:
 
     for writes in (import_, merge):
         writes.add_argument(
-            "-o", "--out", type=Path, required=True, metavar="FILE", help="the *.map file to write"
+            "-o",
+            "--out",
+            type=file_in_new_folder,
+            required=True,
+            metavar="FILE",
+            help="the *.map file to write",
         )
         add_settings_flags(writes)
 

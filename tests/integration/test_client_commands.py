@@ -71,11 +71,6 @@ def run(run_at: Run, map_server: MapServer, map_client: MapClient) -> Run:
         (["mirror", "--lower", "0", "0", "0"], "both corners"),
         (["mirror", "--lower", "0", "0", "0", "--upper", "1", "-1", "1"], "above upper"),
         (["mirror", "--mantissa-bits", "24"], "2 to 23"),
-        (["atoms", "-o", "x.atom"], "-o saves the atom"),
-        (["atoms", "list", "a"], "potclient atoms get a"),
-        (["atoms", "get"], "one ID"),
-        (["atoms", "add"], "name FILEs"),
-        (["atoms", "remove"], "name IDs"),
         (["atoms", "add", "/nonexistent.atom"], "No such file"),
         (["info", "--map", "No Way"], "not an id"),
         (["info", "--cfg", "nonsense"], "KEY:VALUE"),
@@ -112,11 +107,6 @@ def test_mistakes_are_one_clear_line_and_status_2(run: Run, words: list[str], me
         (["export", "bt", "-o", "x", "--resolution", "1", "--band", "0", "1"], "--lower"),
         (["query", "1e9", "0", "0"], "out_of_range"),
         (["map", "load", "elsewhere"], "elsewhere"),
-        (["map", "load"], "name a saved map"),
-        (["map", "merge"], "name a saved map"),
-        (["map", "forget"], "name a robot"),
-        (["map", "clear", "here"], "clear takes no name"),
-        (["map", "load", "here", "--pose", "0", "0", "0", "0"], "load takes no pose"),
         (["info", "--map", "other", "--wait", "0.05"], "maps served here: default"),
     ],
 )
@@ -136,11 +126,40 @@ def test_no_server_is_status_1_with_a_hint(run_at: Run) -> None:
     assert err.count("\n") == 1
 
 
-def test_unwritable_files_are_one_line(run: Run, tmp_path: Path) -> None:
-    status, _, err = run("query", "1", "2", "3", "-o", str(tmp_path / "absent" / "x.npz"))
-    assert status == 1
-    assert "No such file" in err
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["query", "1", "2", "3", "-o", "{}/absent/x.npz"],
+        ["query", "1", "2", "3", "--json", "{}/absent/x.json"],
+        ["query", "1", "2", "3", "-o", "{}"],
+        ["grid", "--resolution", "1", "-o", "{}/absent/x.npz"],
+        ["grid", "--resolution", "1", "--png", "{}/absent/x.png"],
+        ["rays", "0", "0", "1", "-o", "{}/absent/x.npz"],
+        ["risk", "--path", "absent.txt", "--sphere", "0", "0", "0", "1", "--json", "{}/absent/x.json"],
+        ["export", "ply", "-o", "{}/absent/x.ply"],
+        ["mirror", "--once", "-o", "{}/absent/x.npz"],
+        ["atoms", "get", "a", "-o", "{}/absent/a.atom"],
+        ["atoms", "--json", "{}/absent/a.json"],
+        ["publish", "generated", "--json", "{}/absent/x.json"],
+        ["load", "--json", "{}/absent/x.json"],
+        ["info", "--json", "{}/absent/x.json"],
+    ],
+)
+def test_unwritable_files_are_one_line_before_anything_is_asked(
+    run_at: Run, tmp_path: Path, words: list[str]
+) -> None:
+    nobody = f"tcp/127.0.0.1:{free_port()}"
+    status, out, err = run_at(nobody, *(word.format(tmp_path) for word in words))
+    assert (status, out) == (2, "")
+    assert err.startswith(f"potclient: cannot write {tmp_path}")
     assert err.count("\n") == 1
+
+
+def test_a_picture_of_no_known_kind_is_one_line_before_the_question(run_at: Run, tmp_path: Path) -> None:
+    nobody = f"tcp/127.0.0.1:{free_port()}"
+    status, _, err = run_at(nobody, "grid", "--resolution", "1", "--png", str(tmp_path / "z.txt"))
+    assert status == 2
+    assert err == f"potclient: cannot draw {tmp_path / 'z.txt'}: a picture ends in .png, .pdf, .svg, .jpg\n"
 
 
 # --- publish -------------------------------------------------------------------------------------------------------
@@ -415,6 +434,8 @@ def test_info_and_atoms(run: Run, map_client: MapClient, tmp_path: Path) -> None
     assert status == 0
     assert "source: " in out
     assert len(Atom.load(tmp_path / "wall.atom").kernels) == listed[0].n_kernels
+    status, out, _ = run("atoms", "list")
+    assert (status, out.count("\n")) == (0, n + 1)
     status, out, _ = run("atoms", "remove", atom)
     assert (status, out) == (0, f"{atom} removed, {n - 1} atoms, until the server restarts\n")
     status, out, _ = run("atoms", "add", str(tmp_path / "wall.atom"), "--json", "-")

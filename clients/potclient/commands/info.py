@@ -55,7 +55,9 @@ def _cell(key: str, value: Any) -> str:
     if isinstance(value, list):
         return " ".join(_cell(key, v) for v in value)
     if key.endswith("_ns") and isinstance(value, int):
-        return datetime.datetime.fromtimestamp(value // 10**9, datetime.UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
+        return datetime.datetime.fromtimestamp(value // 10**9, datetime.timezone.utc).strftime(
+            "%Y-%m-%dT%H:%M:%SZ"
+        )
     if key.endswith("bytes") and isinstance(value, int):
         return _size(value)
     if key.endswith("uptime_s"):
