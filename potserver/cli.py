@@ -6,6 +6,7 @@ import argparse
 import sys
 from collections.abc import Sequence
 
+from potclient.commands.parsers import CommandParser
 from potclient.errors import DatasetError, UsageError
 from potschemas import __version__
 from potserver.commands import atoms, config, demo, maps, serve
@@ -26,11 +27,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         argv: The words after `potserver`; by default those of this process.
     """
     parser = _parser()
-    options = parser.parse_args(argv)
-    if "run" not in options:
-        parser.print_help()
-        return EXIT_USAGE
     try:
+        options = parser.parse_args(argv)
+        if "run" not in options:
+            parser.print_help()
+            return EXIT_USAGE
         return int(options.run(options))
     except (PotserverError, DatasetError, UsageError) as error:
         say(f"potserver: {error}", sys.stderr)
@@ -41,7 +42,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+    parser = CommandParser(
         prog="potserver", description=_ABOUT, epilog=_FIRST_STEPS, formatter_class=Formatter
     )
     parser.add_argument("--version", action="version", version=f"potserver {__version__}")

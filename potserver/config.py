@@ -335,6 +335,7 @@ def _check(s: Settings) -> None:
             raise SettingsError(f"{path} is {value!r}, need {what}")
 
     try:
+        keys.check_root(s.root)
         keys.check_id(s.server_id, "server_id")
         for map_id in s.maps:
             keys.check_map_id(map_id)
@@ -342,11 +343,6 @@ def _check(s: Settings) -> None:
             keys.check_id(robot_id, "intake.robots")
     except ValueError as error:
         raise SettingsError(str(error)) from error
-    need(
-        "root",
-        bool(re.fullmatch(r"[a-z0-9_.-]+(/[a-z0-9_.-]+)*", s.root)),
-        "chunks of a-z 0-9 _ . - between slashes",
-    )
     need("maps", 0 < len(s.maps) == len(set(s.maps)), "at least one map, each once")
     for table in ("limits", "intake", "queries", "poses"):
         for field in dataclasses.fields(getattr(s, table)):

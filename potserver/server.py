@@ -20,6 +20,7 @@ from types import TracebackType
 import zenoh
 
 from potschemas import __version__, keys
+from potserver.adapters.presence import refuse_second_server
 from potserver.adapters.query_pool import QueryPool
 from potserver.adapters.questions.registry import warm_up
 from potserver.adapters.session import build_config, close_session, open_session
@@ -83,7 +84,8 @@ class MapServer:
         """Listen, warm up, declare, and only then say that we are there.
 
         Raises:
-            SettingsError: an endpoint is taken, or the Zenoh configuration is illegal.
+            SettingsError: an endpoint is taken, the Zenoh configuration is illegal, or another server on the network serves one
+                of the maps.
             DictionaryError: the dictionary file is missing or damaged.
             StorageError: another server has the store, or the disk refuses.
             MapFileError: a kept map is damaged, of another version, or does not fit the settings.
@@ -104,7 +106,10 @@ class MapServer:
                 raise
             atexit.register(self.stop)  # leaving with Zenoh open would abort the process
             try:
+                served = [keys.MapKeys(s.root, map_id) for map_id in s.maps]
+                refuse_second_server(self._session, served)
                 _warm_up(mappers[0])  # all maps share the compiled numerics
+                refuse_second_server(self._session, served)  # one that was warming up beside us
                 self._serve(self._session, mappers, stamps)
             except BaseException:
                 self._teardown(0.0)

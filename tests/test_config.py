@@ -130,6 +130,7 @@ def test_a_profile_sets_what_the_other_keys_start_from(write: Any) -> None:
         ({"root": "pot/**"}, "chunks"),
         ({"root": "/pot"}, "chunks"),
         ({"root": "@pot"}, "chunks"),
+        ({"root": "pot/a b"}, "chunks"),
         ({"threads": 0}, "at least 1"),
         ({"zenoh.mode": "broker"}, "peer, client or router"),
         ({"log.level": "loud"}, "debug, info"),
@@ -220,3 +221,8 @@ def test_the_page_of_settings_is_the_generated_one(root: Path) -> None:
     assert (root / "docs" / "settings.md").read_text() == to_markdown(describe(Settings())) + "\n", (
         "run `make fix`"
     )
+
+
+@pytest.mark.parametrize("root", ["pot/v1", "Site_1/pot", "a/b/c"])
+def test_a_root_is_legal_by_the_rule_of_the_keys(root: str) -> None:
+    assert load_settings(overrides={"root": root}).root == root

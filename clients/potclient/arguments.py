@@ -10,14 +10,22 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from potclient.arrays import Float64
 from potclient.errors import UsageError
-from potschemas.keys import check_id
+from potschemas.keys import MapKeys, check_id, check_map_id, check_root
 from potschemas.messages import Unknown
 
 
 def legal_id(value: str, what: str) -> str:
-    """An id of a map, robot, server, verb or saved map."""
+    """An id of a robot, server, verb or saved map."""
     try:
         return check_id(value, what)
+    except ValueError as error:
+        raise UsageError(str(error)) from error
+
+
+def map_keys(root: str, map_id: str) -> MapKeys:
+    """The keys of one map, by the rules that a server's settings follow."""
+    try:
+        return MapKeys(check_root(root), check_map_id(map_id))
     except ValueError as error:
         raise UsageError(str(error)) from error
 

@@ -22,6 +22,7 @@ from potclient.commands import (
     town,
     watch,
 )
+from potclient.commands.parsers import CommandParser
 from potclient.commands.shared import EXIT_FAILED, EXIT_INTERRUPTED, EXIT_USAGE, complain
 from potclient.errors import DatasetError, MapServerError, PotclientError, UsageError
 from potclient.zenoh_config import DEFAULT_ENDPOINT
@@ -32,9 +33,9 @@ _VERBS = (publish, query, grid, rays, risk, export, mirror, watch, load, info, a
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; the result is the exit status: 0 done, 1 failed, 2 wrong usage, 130 interrupted."""
-    arguments = build_parser().parse_args(argv)
-    command: Callable[[argparse.Namespace], int] = arguments.command
     try:
+        arguments = build_parser().parse_args(argv)
+        command: Callable[[argparse.Namespace], int] = arguments.command
         return command(arguments)
     except (UsageError, DatasetError) as error:
         return complain(str(error), EXIT_USAGE)
@@ -54,7 +55,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def build_parser() -> argparse.ArgumentParser:
     """All commands and their flags."""
-    parser = argparse.ArgumentParser(
+    parser = CommandParser(
         prog="potclient",
         description="Feed a potserver map and ask it: occupancy with uncertainty, anywhere, over Zenoh.",
         epilog=f"""examples:

@@ -14,7 +14,7 @@ import numpy as np
 import zenoh
 from numpy.typing import ArrayLike, NDArray
 
-from potclient.arguments import legal_id
+from potclient.arguments import map_keys
 from potclient.atoms import Atom
 from potclient.clouds import Clouds, cloud_message
 from potclient.errors import UsageError
@@ -32,7 +32,7 @@ from potclient.questions.tiles import MIRROR_MARGIN_M
 from potclient.results import FeedCounts, Receipt, TransportedParams
 from potclient.session import SessionOptions
 from potschemas import messages
-from potschemas.keys import DEFAULT_ROOT, MapKeys, stats_key
+from potschemas.keys import DEFAULT_ROOT, stats_key
 
 log = logging.getLogger("potclient")
 
@@ -58,7 +58,7 @@ class MapClient:
         feed: How clouds are published, and who is told of their receipts.
         options: Zenoh session options; `connect` is added when they name no endpoint.
     Raises:
-        UsageError: an id or an option is not legal.
+        UsageError: an id, the root or an option is not legal.
         NoServerError: nobody listens at the endpoint.
     """
 
@@ -77,7 +77,7 @@ class MapClient:
         options = options or SessionOptions()
         if connect is not None and not options.connect:
             options = dataclasses.replace(options, connect=(connect,))
-        self.keys = MapKeys(root, legal_id(map, "map"))
+        self.keys = map_keys(root, map)
         self._link = Link(self.keys, options, timeout_s)
         self._clouds = Clouds(self._link, feed or FeedOptions())
         self._points = PointsQuestion(self._link)

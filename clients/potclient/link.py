@@ -7,6 +7,7 @@ keep a process alive that forgot to close its session.
 from __future__ import annotations
 
 import contextlib
+import functools
 import logging
 import math
 import threading
@@ -206,7 +207,12 @@ class Link:
     def _other_maps_hint(self) -> str:
         with self._servers_changed:
             maps = sorted({map_id for _, map_id in self._alive} - {self.keys.map_id})
-        return f"; maps served here: {', '.join(maps)}" if maps else "; start one with `potserver serve`"
+        if maps:
+            return f"; maps served here: {', '.join(maps)}"
+        return (
+            f"; no server has announced itself under the root {self.keys.root!r}: one that has just started is warming up"
+            " (`--wait SECONDS` or `wait_ready` waits for it), or start one with `potserver serve`"
+        )
 
     # --- questions -----------------------------------------------------------------------------------------------------------
 
@@ -238,18 +244,22 @@ class Link:
         timeout_s = self.timeout_s if timeout_s is None else timeout_s
         if not (math.isfinite(timeout_s) and timeout_s > 0):
             raise UsageError(f"timeout_s {timeout_s}: need a positive number of seconds")
+        was_ready = bool(self.servers)
         sent: dict[str, Any] = {"payload": encode(request), "encoding": encoding_of(request)}
         if timeout_s == self.timeout_s:
             replies = self._call(self._querier(key).get, **sent)
         else:  # the time-out of a declared querier is fixed
             replies = self._call(self._session.get, key, timeout=timeout_s, **sent, **_query_qos(key))
-        return self._checked(replies, key, len(sent["payload"]), timeout_s)
+        for_silence = functools.partial(self._silence, key, len(sent["payload"]), was_ready)
+        return self._checked(replies, key, timeout_s, for_silence)
 
     def deadline_ms(self, timeout_s: float | None) -> float:
         """The deadline that a message carries, so that the server starts no work that nobody waits for."""
         return (self.timeout_s if timeout_s is None else timeout_s) * 1e3
 
-    def _checked(self, replies: Any, key: str, n_bytes: int, timeout_s: float) -> Iterator[zenoh.Sample]:
+    def _checked(
+        self, replies: Any, key: str, timeout_s: float, for_silence: Callable[[], PotclientError]
+    ) -> Iterator[zenoh.Sample]:
         n = 0
         for reply in replies:
             if reply.ok is not None:
@@ -266,10 +276,16 @@ class Link:
                 error = BadReplyError(f"{key}: an error reply that is none of ours: {payload[:80]!r}")
             raise error
         if n == 0:
-            raise self._silence(key, n_bytes)
+            raise for_silence()
 
-    def _silence(self, key: str, n_bytes: int) -> PotclientError:
-        """Why a question got no answer at all. Zenoh reports all of these alike: as an empty list of replies."""
+    def _silence(self, key: str, n_bytes: int, was_ready: bool) -> PotclientError:
+        """Why a question got no answer at all. Zenoh reports all of these alike: as an empty list of replies.
+
+        Args:
+            key: Of the question.
+            n_bytes: Of the question.
+            was_ready: Whether a server's token had been heard of when it was asked.
+        """
         if self.is_closed:
             return ClosedError("the client was closed")
         if not self._call(self._session.info.transports):
@@ -292,6 +308,11 @@ class Link:
         if not is_alive:
             return NoServerError(
                 f"{key}: a server is there but not ready (warming up, or just gone); `wait_ready` waits for it"
+            )
+        if not was_ready:
+            return NoServerError(
+                f"{key}: no answer, and the server has announced itself only since: it was warming up, ask again. If that does"
+                " not help, its access control or size filter holds the question back"
             )
         return LostReplyError(
             f"{key}: a server is up but the question of {n_bytes} bytes got no answer: denied by access control, above its size"

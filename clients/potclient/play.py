@@ -10,12 +10,15 @@ from typing import Any
 
 import numpy as np
 
+from potclient.arrays import Float64
 from potclient.client import MapClient
 from potclient.datasets.scans import RecordedScan, Recording
 from potclient.errors import MapServerError, PotclientError
 from potclient.holdout import HoldOut, LabelledPoints
 from potclient.metrics import Metrics, score
 from potclient.results import Receipt
+
+_ROUNDING = 1.001  # beams that were cut at the server's range end there, and not beyond
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -46,8 +49,10 @@ class PlayReport:
     scans: list[ScanOutcome]
     elapsed_s: float
     held_out: Metrics | None = None
+    beyond_range: float = 0.0  # share of the held-out beams that end beyond the server's range
+    range_m: float | None = None  # of the server, where a score was asked for
     n_held_out: int = 0  # labelled points; the score may be of a fixed-seed sample of them
-    failure: PotclientError | KeyboardInterrupt | None = None  # what ended it before the last scan
+    failure: PotclientError | KeyboardInterrupt | None = None  # what ended it early
 
     @property
     def all_accepted(self) -> bool:
@@ -68,6 +73,8 @@ class PlayReport:
             "elapsed_s": self.elapsed_s,
             "held_out": None if self.held_out is None else self.held_out._asdict(),
             "n_held_out": self.n_held_out,
+            "beyond_range": self.beyond_range,
+            "range_m": self.range_m,
             "scans": [dataclasses.asdict(scan) for scan in self.scans],
         }
 
@@ -107,14 +114,17 @@ def play(
     started = time.monotonic()
     book = _Book(client, sending, on_outcome)
     labelled: list[LabelledPoints] = []
+    held_ranges_m: list[Float64] = []
     failure: PotclientError | KeyboardInterrupt | None = None
     previous, client.on_receipt = client.on_receipt, book.on_receipt
     try:
         for index, recorded in enumerate(recording):
             scan = recorded
             if hold_out is not None:
-                scan, labels = hold_out.split(scan)
+                scan, labels = hold_out.split(recorded, index)
                 labelled.append(labels)
+                held = recorded.points[hold_out.beams(len(recorded), index)]
+                held_ranges_m.append(np.linalg.norm(held.astype(np.float64), axis=1))
             if sending.rate_hz is not None:
                 time.sleep(max(0.0, started + index / sending.rate_hz - time.monotonic()))
             book.send(index, scan)
@@ -129,9 +139,15 @@ def play(
     if hold_out is None or failure is not None:
         return report
     labels = LabelledPoints.concatenate(labelled)
-    return dataclasses.replace(
-        report, held_out=score_map(client, labels, max_test_points), n_held_out=len(labels)
-    )
+    report = dataclasses.replace(report, n_held_out=len(labels))
+    try:
+        range_m = client.info().limits.max_range_m  # first: with the limits, the client splits its question
+        report = dataclasses.replace(report, held_out=score_map(client, labels, max_test_points))
+        beyond = np.concatenate([np.zeros(0), *held_ranges_m]) > range_m * _ROUNDING
+        share = float(beyond.mean()) if len(beyond) else 0.0
+        return dataclasses.replace(report, range_m=range_m, beyond_range=share)
+    except (PotclientError, KeyboardInterrupt) as error:  # the receipts are known all the same
+        return dataclasses.replace(report, failure=error)
 
 
 def score_map(

@@ -79,7 +79,9 @@ def open_session(options: SessionOptions) -> zenoh.Session:
 
 
 def add_zenoh_arguments(parser: argparse.ArgumentParser) -> None:
-    """Zenoh's usual flags, as in its own examples."""
+    """Zenoh's usual flags, as in its own examples. A parser with `argument_default` gets no other defaults."""
+    if parser.argument_default is None:
+        parser.set_defaults(cfg=[], multicast_scouting=None, no_shm=False, wait=0.0)
     group = parser.add_argument_group("Zenoh session")
     group.add_argument(
         "-e",
@@ -104,14 +106,12 @@ def add_zenoh_arguments(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--cfg",
         action="append",
-        default=[],
         metavar="KEY:VALUE",
         help="one configuration value as JSON5, e.g. --cfg 'transport/link/tx/lease:5000'; may be repeated",
     )
     group.add_argument(
         "--multicast-scouting",
         action=argparse.BooleanOptionalAction,
-        default=None,
         help="look for servers by multicast (default: off)",
     )
     group.add_argument(
@@ -122,7 +122,6 @@ def add_zenoh_arguments(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--wait",
         type=float,
-        default=0.0,
         metavar="SECONDS",
         help="wait this long for the server to come up and be ready (default 0)",
     )

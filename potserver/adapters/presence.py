@@ -3,15 +3,55 @@
 from __future__ import annotations
 
 import threading
+import time
+from collections.abc import Iterable
 
 import zenoh
 
 from potschemas import keys
 from potserver.adapters.key_exprs import sender_of
+from potserver.errors import SettingsError
 from potserver.health import Health
 from potserver.log import get_logger
 
 log = get_logger("potserver.presence")
+
+
+# The token of a process that ended vanishes with its connection: at once, or after Zenoh's lease of 10 s where the
+# machine or the network went away.
+GONE_S = 12.0
+_POLL_S = 0.25
+_ASK_S = 2.0  # for the tokens that routers know
+
+
+def refuse_second_server(session: zenoh.Session, maps: Iterable[keys.MapKeys]) -> None:
+    """Wait until nobody else serves our maps: two writers of one map would each give every cloud a receipt.
+
+    A token may be that of a server that has just crashed, so it gets `GONE_S` to vanish.
+
+    Raises:
+        SettingsError: another server still serves one of them.
+    """
+    until = time.monotonic() + GONE_S
+    for map_keys in maps:
+        waited = False
+        while others := _servers(session, map_keys):
+            names = ", ".join(others)
+            if time.monotonic() >= until:
+                raise SettingsError(
+                    f"map {map_keys.map_id!r} under the root {map_keys.root!r} is served already, by {names}: serve"
+                    " another map (--map ID), take another root (--root KEY), or stop that server"
+                )
+            if not waited:
+                waited = True
+                log.warning("map_served_already", map_id=map_keys.map_id, server_id=names, wait_s=GONE_S)
+            time.sleep(_POLL_S)
+
+
+def _servers(session: zenoh.Session, map_keys: keys.MapKeys) -> list[str]:
+    """Ids of the servers of a map that others have announced."""
+    replies = session.liveliness().get(map_keys.server_token("*"), timeout=_ASK_S)
+    return sorted({str(reply.ok.key_expr).rsplit("/", 2)[1] for reply in replies if reply.ok is not None})
 
 
 class ServerToken:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
+from potclient.commands.output_files import output_file, output_folder, picture_file
 from potserver.commands import atoms_build
 from potserver.commands.shared import (
     EXIT_OK,
@@ -55,7 +56,7 @@ def add(commands: Any) -> None:
     info = add_verb(verbs, "info", _info, help="list the atoms", description=_INFO)
     info.add_argument("file", nargs="?", help="a dictionary file; default: the one that the settings name")
     info.add_argument("--json", action="store_true", help="everything, with provenance")
-    info.add_argument("--picture", metavar="PNG", help="draw atoms to this file")
+    info.add_argument("--picture", type=picture_file, metavar="FILE", help="draw atoms to this file")
     info.add_argument("--atom", action="append", default=[], metavar="ID", help="draw this one; repeatable")
     info.add_argument(
         "--limit", type=int, default=8, metavar="N", help="draw N at most, spread over the dictionary [8]"
@@ -64,7 +65,9 @@ def add(commands: Any) -> None:
 
     export = add_verb(verbs, "export", _export, help="write atoms as single files", description=_EXPORT)
     export.add_argument("atom_id", nargs="*", metavar="ID", help="which ones [all]")
-    export.add_argument("-o", "--out", required=True, metavar="FOLDER", help="where the *.atom files go")
+    export.add_argument(
+        "-o", "--out", type=output_folder, required=True, metavar="FOLDER", help="where the *.atom files go"
+    )
     add_settings_flags(export)
 
     import_ = add_verb(
@@ -72,7 +75,12 @@ def add(commands: Any) -> None:
     )
     import_.add_argument("file", nargs="+", metavar="FILE", help="*.atom files")
     import_.add_argument(
-        "-o", "--out", required=True, metavar="FILE", help="the dictionary; made if there is none"
+        "-o",
+        "--out",
+        type=output_file,
+        required=True,
+        metavar="FILE",
+        help="the dictionary; made if there is none",
     )
     add_settings_flags(import_)
 
@@ -137,7 +145,7 @@ def _export(options: argparse.Namespace) -> int:
     dictionary = dictionary_of(settings.dictionary)
     atoms = [dictionary.get(atom_id) for atom_id in options.atom_id] or list(dictionary)
     rule = method_of(settings.mapping.profile).rule
-    folder = Path(options.out)
+    folder = options.out
     with file_errors(f"write to {folder}"):
         folder.mkdir(parents=True, exist_ok=True)
         for atom in atoms:
@@ -151,7 +159,7 @@ def _import(options: argparse.Namespace) -> int:
     from potserver.codec.atoms import read_atom_file
     from potserver.domain.dictionary import AtomDictionary
 
-    out = Path(options.out)
+    out = options.out
     dictionary = AtomDictionary.load(out) if out.exists() else AtomDictionary()
     for name in options.file:
         with file_errors(f"read {name}"):

@@ -13,11 +13,11 @@ from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Any
 
+from potclient.commands.output_files import output_file
 from potserver.commands.shared import (
     EXIT_FORCED,
     EXIT_OK,
     add_verb,
-    check_writable,
     results_console,
     say,
     table,
@@ -55,7 +55,9 @@ def add(commands: Any) -> None:
         commands, "build", _run, help="learn a dictionary from recordings", description=_ABOUT, epilog=_EXAMPLES
     )  # fmt: skip
     parser.add_argument("datasets", nargs="*", metavar="DATASET", help="recordings to learn from")
-    parser.add_argument("-o", "--out", required=True, metavar="FILE", help="dictionary file to write")
+    parser.add_argument(
+        "-o", "--out", type=output_file, required=True, metavar="FILE", help="dictionary file to write"
+    )
     parser.add_argument("--recipe", metavar="FILE", help="TOML file that says what to learn from, and how")
     parser.add_argument(
         "--builtin", action="store_true", help="the recipe of the dictionary that the package ships"
@@ -112,7 +114,6 @@ def _build(options: argparse.Namespace) -> Built:
     from potserver.atoms.build.builder import build, scan_tasks
 
     recipe, folder = recipe_of(options)
-    check_writable(options.out)
     workers = _workers(options)
     console = results_console()
     started = time.monotonic()

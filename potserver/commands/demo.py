@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potclient import MapClient
+from potclient.commands.output_files import output_folder
 from potclient.datasets import RecordedScan, Recording, open_dataset
 from potclient.holdout import HoldOut, LabelledPoints
 from potclient.metrics import Metrics, score
@@ -94,7 +95,9 @@ def add(commands: Any) -> None:
     parser.add_argument(
         "--scans", type=positive_int, metavar="N", help="at most this many scans of each recording"
     )
-    parser.add_argument("--out", default="out/demo", metavar="FOLDER", help="where results go [out/demo]")
+    parser.add_argument(
+        "--out", type=output_folder, default="out/demo", metavar="FOLDER", help="where results go [out/demo]"
+    )
 
 
 def _run(options: argparse.Namespace) -> int:
@@ -109,7 +112,7 @@ def _run(options: argparse.Namespace) -> int:
     recordings = _recordings(options)
     mapping = MappingSettings.of_profile(options.profile)
     settings = Settings(server_id="demo", maps=tuple(recordings), mapping=mapping)
-    out = Path(options.out)
+    out = options.out
     with file_errors(f"make {out}"):
         out.mkdir(parents=True, exist_ok=True)
     _introduce(options, recordings, console)

@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from potclient.commands.output_files import output_file
 from potclient.datasets import FORMATS, FRAMES
 from potclient.errors import DatasetError, UsageError
 from potclient.holdout import HoldOut
@@ -21,7 +22,6 @@ from potserver.commands.shared import (
     EXIT_OK,
     add_mapping_flags,
     add_verb,
-    check_writable,
     dictionary_of,
     positive_int,
     results_console,
@@ -90,8 +90,10 @@ def add(commands: Any) -> None:
     )
     _add_beam_flags(parser.add_argument_group("beams"))
     out = parser.add_argument_group("results")
-    out.add_argument("--json", metavar="FILE", help="all numbers, with the machine and the options")
-    out.add_argument("--markdown", metavar="FILE", help="the tables, for a document")
+    out.add_argument(
+        "--json", type=output_file, metavar="FILE", help="all numbers, with the machine and the options"
+    )
+    out.add_argument("--markdown", type=output_file, metavar="FILE", help="the tables, for a document")
 
 
 def _add_beam_flags(beams: Any) -> None:
@@ -130,7 +132,6 @@ def _run(options: argparse.Namespace) -> int:
 
     settings = settings_of(options)
     configure_logging("warning", "console")
-    check_writable(options.json, options.markdown)
     dictionary = dictionary_of(settings.dictionary)
     threads = settings.threads or default_threads()
     console = results_console(_COLUMNS)
@@ -145,9 +146,9 @@ def _run(options: argparse.Namespace) -> int:
         found.append(evaluation)
         _print(evaluation, console, settings.mapping)
     if options.json is not None:
-        Path(options.json).write_text(json.dumps(_report(found, options, threads), indent=1) + "\n")
+        options.json.write_text(json.dumps(_report(found, options, threads), indent=1) + "\n")
     if options.markdown is not None:
-        Path(options.markdown).write_text(to_markdown(found))
+        options.markdown.write_text(to_markdown(found))
     return EXIT_OK
 
 
@@ -264,7 +265,11 @@ def _machine(threads: int) -> str:
 
 
 def _report(found: list[Evaluation], options: argparse.Namespace, threads: int) -> dict[str, Any]:
-    shown = {key: value for key, value in vars(options).items() if key != "run"}
+    shown = {
+        key: str(value) if isinstance(value, Path) else value
+        for key, value in vars(options).items()
+        if key != "run"
+    }
     return {
         "machine": _machine(threads),
         "options": shown,

@@ -7,6 +7,7 @@ import dataclasses
 import functools
 import json
 import re
+import sys
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -15,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potclient.commands import export_flags, pose_flag
+from potclient.commands.output_files import file_in_new_folder
 from potclient.octomap import DEPTH, KEY_ORIGIN, Leaves, read_bt
 from potserver.commands.shared import (
     EXIT_OK,
@@ -32,10 +34,11 @@ if TYPE_CHECKING:
     from potserver.domain.map_state import MapState
     from potserver.mapping.service import MakePipeline, MappingService
     from potserver.mapping.settings import MappingSettings
-    from potserver.storage.map_file import Origin
+    from potserver.storage.map_file import Origin, SavedMap
 
 _INFO = """\
-What is in a saved map (*.map), in one map's folder, or in a whole store: read, checked and counted."""
+What is in a saved map (*.map), in one map's folder, or in a whole store: read, checked and counted. Beside a running
+server this is its last snapshot; `potclient map save` writes a newer one."""
 
 _EXPORT = """\
 Write a saved map as a file that other programs read, as `potclient export` does for a served one.
@@ -73,6 +76,7 @@ examples:
   potserver map merge south.map north.map --pose 120 -35 0 40 -o campus.map
                                               north's origin lies there, turned by 40 degrees"""
 
+_IN_USE = "a server runs on it; this is its last snapshot, `potclient map save` writes a newer one"
 _ONE_MAP = "a *.map file, or a map's folder in a store"
 
 # An OctoMap clamps its voxels. So many hits make one as occupied as it can get, ln(.971 / .029) / ln(.7 / .3), and so many
@@ -121,7 +125,12 @@ def add(commands: Any) -> None:
 
     for writes in (import_, merge):
         writes.add_argument(
-            "-o", "--out", type=Path, required=True, metavar="FILE", help="the *.map file to write"
+            "-o",
+            "--out",
+            type=file_in_new_folder,
+            required=True,
+            metavar="FILE",
+            help="the *.map file to write",
         )
         add_settings_flags(writes)
 
@@ -174,7 +183,7 @@ def _described(path: Path) -> dict[str, Any]:
     from potserver.storage.map_store import JOURNAL, TILES
 
     saved = read_map(path)
-    r, table = saved.record, describe(saved, path)
+    r, table = saved.record, describe(saved)
     lines: dict[str, Any] = {
         "file": str(path),
         "map": r.map_id,
@@ -195,7 +204,11 @@ def _described(path: Path) -> dict[str, Any]:
     if not r.keeps_evidence:
         lines["evidence"] = "none: a map of profile paper, or of kernels alone"
     if path.name == TILES:
-        lines["scans in the journal"] = scans_after(path.with_name(JOURNAL), r.number)
+        in_journal = scans_after(path.with_name(JOURNAL), r.number)
+        if in_journal is None:
+            lines["in use"] = _IN_USE
+        else:
+            lines["scans in the journal"] = in_journal
     return lines
 
 
@@ -210,10 +223,10 @@ def _bytes_on_disk(path: Path) -> int:
 
 def _export(options: argparse.Namespace) -> int:
     from potserver.commands.unserved import UnservedMap
-    from potserver.storage.map_file import read_map
 
     export_flags.check_export_flags(options)
-    return export_flags.export_map(UnservedMap(read_map(_one_file(options.path))), options)
+    saved, _ = _read_file(_one_file(options.path))
+    return export_flags.export_map(UnservedMap(saved), options)
 
 
 # --- import -----------------------------------------------------------------------------------------------------------
@@ -245,17 +258,29 @@ def _import(options: argparse.Namespace) -> int:
 
 def _from_saved(file: Path) -> tuple[MapState, Origin]:
     """The state in a map file, whose snapshot answers as the saved one did, and its `Origin`."""
-    from potserver.storage.journal import scans_after
-    from potserver.storage.map_file import Origin, read_map
-    from potserver.storage.map_store import JOURNAL, TILES
+    from potserver.storage.map_file import Origin
 
-    saved = read_map(file)
+    saved, left = _read_file(file)
     r = saved.record
-    left = scans_after(file.with_name(JOURNAL), r.number) if file.name == TILES else 0
     if left:
         say(f"{left} scans of the journal are not in it: only a server integrates them")
     state = dataclasses.replace(saved.state(), snapshot=saved.kernel_map())
     return state, Origin(r.map_id, r.keeps_evidence, r.stamps)
+
+
+def _read_file(file: Path) -> tuple[SavedMap, int]:
+    """The map in a file, and how many scans its journal has beyond it; says where a server writes both."""
+    from potserver.storage.journal import scans_after
+    from potserver.storage.map_file import read_map
+    from potserver.storage.map_store import JOURNAL, TILES
+
+    saved = read_map(file)
+    if file.name != TILES:
+        return saved, 0
+    left = scans_after(file.with_name(JOURNAL), saved.record.number)
+    if left is None:
+        say(f"{file}: {_IN_USE}", sys.stderr)
+    return saved, left or 0
 
 
 def _from_octomap(path: Path, looks: float, settings: Settings) -> MapState:

@@ -26,6 +26,8 @@ Serve maps to robots and planners over Eclipse Zenoh.
 
 The server listens on tcp/127.0.0.1:7447 only. It needs no router: robots connect to it in client mode.
 It is ready when it logs server_started, and when its liveliness token is up.
+One server a map: it ends with exit code 2 where another one on the network serves the same map under the same root. The
+token of one that has just crashed gets 12 s to vanish.
 Its maps survive restarts and crashes: every accepted cloud is on the disk before its receipt. server_started says
 where they are kept (--store) and how many clouds each holds. One server a store.
 Anyone who reaches the port may write: use Zenoh's access control and TLS.

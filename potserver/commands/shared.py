@@ -201,17 +201,6 @@ def _split(assignment: str, separator: str, flag: str, form: str) -> tuple[str, 
 # --- files and output ---------------------------------------------------------------------------------------
 
 
-def check_writable(*files: str | None) -> None:
-    """Refuse files whose folder is missing, before the work and not after it.
-
-    Raises:
-        SettingsError: there is no such folder.
-    """
-    for file in files:
-        if file is not None and not Path(file).absolute().parent.is_dir():
-            raise SettingsError(f"cannot write {file}: no folder {Path(file).absolute().parent}")
-
-
 @contextlib.contextmanager
 def file_errors(doing: str) -> Iterator[None]:
     """An OSError inside the block becomes a SettingsError: "cannot <doing>: <why>"."""

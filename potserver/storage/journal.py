@@ -14,7 +14,7 @@ from pathlib import Path
 
 import msgspec
 
-from potserver.errors import MapFileError
+from potserver.errors import MapFileError, StorageError
 from potserver.storage.seal import sealed, unsealed
 from potserver.storage.sqlite import Kind, connect, connect_read_only, reading, transaction
 
@@ -162,14 +162,19 @@ class Journal:
         )
 
 
-def scans_after(path: Path, number: int) -> int:
-    """How many scans with higher numbers a journal has that nobody has open; it is not changed.
+def scans_after(path: Path, number: int) -> int | None:
+    """How many scans with higher numbers a journal has, or None where a server has it open; it is not changed.
 
     Raises:
-        MapFileError: it is missing or damaged. StorageError: a server has it open.
+        MapFileError: it is missing or damaged. StorageError: it cannot be opened.
     """
-    with contextlib.closing(connect_read_only(path, _KIND)) as connection, reading(path):
-        row = connection.execute("SELECT COUNT(*) FROM scans WHERE number > ?", (number,)).fetchone()
+    try:
+        with contextlib.closing(connect_read_only(path, _KIND, busy_s=0.0)) as connection, reading(path):
+            row = connection.execute("SELECT COUNT(*) FROM scans WHERE number > ?", (number,)).fetchone()
+    except StorageError as error:
+        if error.reason == "in_use":
+            return None
+        raise
     return int(row[0])
 
 

@@ -82,6 +82,7 @@ class SavedMap(NamedTuple):
 
     record: MapRecord
     tiled: TiledMap | None
+    n_bytes: int  # of the tiles as they are kept
 
     def kernel_map(self) -> KernelMap:
         """The map that answers as the saved one did."""
@@ -219,7 +220,7 @@ def write_map(path: Path, state: MapState, origin: Origin) -> int:
 
 
 def read_map(path: Path) -> SavedMap:
-    """Read a `*.map` file or a store's `tiles.sqlite`.
+    """Read a `*.map` file or a store's `tiles.sqlite`, beside the server that writes it too: from one transaction.
 
     Args:
         path: The file.
@@ -229,7 +230,10 @@ def read_map(path: Path) -> SavedMap:
     with contextlib.closing(connect_read_only(path, _KIND)) as connection:
         saved = _read(connection, path, {})
     if saved is None:
-        raise MapFileError(f"{path} holds no map yet", reason="empty")
+        raise MapFileError(
+            f"{path} holds no map yet: a server writes it at its first snapshot, or at `potclient map save`",
+            reason="empty",
+        )
     return saved
 
 
@@ -241,15 +245,13 @@ class Contents(NamedTuple):
     n_bytes: int  # of the tiles as they are kept
 
 
-def describe(saved: SavedMap, path: Path) -> Contents:
+def describe(saved: SavedMap) -> Contents:
     """Count what a map file holds."""
     tiles = [] if saved.tiled is None else list(saved.tiled.tiles.values())
-    with contextlib.closing(connect_read_only(path, _KIND)) as connection, reading(path):
-        n_bytes = int(connection.execute("SELECT COALESCE(SUM(LENGTH(data)), 0) FROM tiles").fetchone()[0])
     return Contents(
         n_rows=sum(len(tile.rows.kind) for tile in tiles),
         n_kernels=sum(len(tile.kernels) for tile in tiles),
-        n_bytes=n_bytes,
+        n_bytes=saved.n_bytes,
     )
 
 
@@ -286,6 +288,7 @@ def _read(
 ) -> SavedMap | None:
     """Read everything in one transaction, so that a writer beside us does not matter; `written` is filled."""
     tiles: dict[TileIndex, Tile] = {}
+    n_bytes = 0
     with reading(path), contextlib.ExitStack() as stack:
         connection.execute("BEGIN")
         stack.callback(connection.execute, "COMMIT")
@@ -306,13 +309,14 @@ def _read(
             if list(index) != named:
                 raise _damaged(path, f"tile {index} stands at {tuple(named)}")
             tiles[index] = tile
+            n_bytes += len(data)
             written[index] = (tile.revision, seal_number(data))
     if len(tiles) != record.n_tiles or f"{_sum(d for _, d in written.values()):x}" != record.tiles_digest:
         raise _damaged(path, f"it has {len(tiles)} tiles, and not the {record.n_tiles} that were written")
     if grid is None:
-        return SavedMap(record, None)
+        return SavedMap(record, None, 0)
     tiled = TiledMap.empty(grid)._replace(robots=tuple(record.robots)).with_tiles(tiles)
-    return SavedMap(record, tiled)
+    return SavedMap(record, tiled, n_bytes)
 
 
 def _parse(path: Path, data: object) -> MapRecord:

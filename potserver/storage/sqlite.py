@@ -66,17 +66,22 @@ def connect(
     return connection
 
 
-def connect_read_only(path: Path, kind: Kind) -> sqlite3.Connection:
+def connect_read_only(path: Path, kind: Kind, *, busy_s: float = _BUSY_S) -> sqlite3.Connection:
     """Open a file that is there, to read.
 
+    Args:
+        path: The file.
+        kind: What it must be.
+        busy_s: How long to wait for somebody who has it open alone.
     Raises:
         MapFileError: there is none, it is not such a file, of another version, or damaged.
+        StorageError: somebody else has it open alone; `reason` is `in_use`.
     """
     if not path.is_file():
         raise MapFileError(f"no map file at {path}", reason="missing")
     with reading(path):
         connection = sqlite3.connect(
-            f"{path.absolute().as_uri()}?mode=ro", uri=True, isolation_level=None, timeout=_BUSY_S
+            f"{path.absolute().as_uri()}?mode=ro", uri=True, isolation_level=None, timeout=busy_s
         )
     try:
         with reading(path):
@@ -167,5 +172,6 @@ def _is_locked(error: Exception) -> bool:
 def _in_use(path: Path) -> StorageError:
     return StorageError(
         f"{path} is in use: another server keeps its map there; give this one a store of its own"
-        " (--store, or another --server-id), or none (--in-memory)"
+        " (--store, or another --server-id), or none (--in-memory)",
+        reason="in_use",
     )

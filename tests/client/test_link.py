@@ -5,6 +5,11 @@ from __future__ import annotations
 import subprocess
 import sys
 
+import pytest
+
+from potclient import MapClient
+from potclient.errors import UsageError
+
 
 def test_first_messages_may_come_on_many_threads_at_once() -> None:
     program = """
@@ -29,3 +34,18 @@ for t in threads: t.join()
         )
         assert done.returncode == 0, done.stderr
         assert not done.stderr
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"root": "pot/**"}, "chunks"),
+        ({"root": "/pot"}, "chunks"),
+        ({"root": ""}, "chunks"),
+        ({"map": "srv"}, "cannot be called 'srv'"),
+        ({"map": "A b"}, "is not an id"),
+    ],
+)
+def test_a_client_names_maps_and_roots_by_the_servers_rule(options: dict[str, str], message: str) -> None:
+    with pytest.raises(UsageError, match=message):
+        MapClient("tcp/127.0.0.1:1", **options)

@@ -111,6 +111,45 @@ def test_info_counts_the_log_of_a_store_that_was_killed(tmp_path: Path, run: Run
     assert told["bytes"] > told["bytes of tiles"] > 0
 
 
+def test_a_store_that_a_server_has_open_is_read_and_said_to_be_in_use(tmp_path: Path, run: Run) -> None:
+    service = MappingService(settings=SETTINGS, threads=1)
+    folder = tmp_path / "store"
+    store = MapStore(folder, "site", keeps_evidence=True, health=Health(), fsync=False)
+    store.restore(service)
+
+    def take(number: int) -> None:
+        scan = make_scan(number)
+        service.integrate(scan, commit=lambda: store.append(scan))
+        store.advance(service, {})
+
+    take(1)
+    code, _, err = run("info", folder)
+    assert code == 2
+    assert "holds no map yet" in err
+    assert "potclient map save" in err
+    store.save(None, service, {})
+    n = len(service.snapshot)
+    take(2)
+    code, out, err = run("info", folder, "--json")
+    assert (code, err) == (0, "")
+    (told,) = json.loads(out)
+    assert (told["scans"], told["kernels"]) == (1, n)
+    assert "a server runs" in told["in use"]
+    assert "scans in the journal" not in told
+    for path in (folder, folder / "site"):
+        code, _, err = run("export", path, "-f", "npz", "-o", tmp_path / "out.npz", "-q")
+        assert code == 0
+        assert "a server runs" in err
+        assert len(ClientKernels.load(tmp_path / "out.npz")) == n
+    code, out, err = run("import", folder, "-o", tmp_path / "copy.map")
+    assert code == 0
+    assert "a server runs" in err
+    take(3)
+    assert service.n_scans == 3, "the server goes on"
+    assert store.close()
+    assert "in use" not in json.loads(run("info", folder, "--json")[1])[0]
+
+
 def test_what_is_no_map_is_one_line_and_exit_code_two(tmp_path: Path, saved: Path, run: Run) -> None:
     damaged = tmp_path / "damaged.map"
     content = bytearray(saved.read_bytes())

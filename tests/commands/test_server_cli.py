@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 
 from potclient.atoms import Atom
+from potschemas import __version__
 from potserver import cli
 from potserver.commands.config import to_toml
 from potserver.commands.serve import StopSignals
@@ -139,9 +140,9 @@ def test_variables_are_read(capsys: pytest.CaptureFixture[str], monkeypatch: pyt
         (["config", "show", "--root", "**"], "chunks"),
         (["atoms", "info", "/no/such.atoms"], "no atom dictionary at"),
         (["atoms", "build", "-o", "x.npz"], "recordings to learn from"),
-        (["atoms", "info", "--picture", "/no/such/folder/x.png", "--limit", "0"], "cannot draw 0 atoms"),
+        (["atoms", "info", "--picture", "x.png", "--limit", "0"], "cannot draw 0 atoms"),
         (["atoms", "export", "nope", "-o", "x"], "no atom 'nope'"),
-        (["atoms", "import", "/no/such.atom", "-o", "/no/such.atoms"], "cannot read /no/such.atom"),
+        (["atoms", "import", "/no/such.atom", "-o", "x.atoms"], "cannot read /no/such.atom"),
         (["config", "show", "--set", "atoms.save=true"], "need the setting `dictionary`"),
         (["config", "show", "--set", "atoms.admission.min_auc=1"], "atoms.admission"),
         (["serve", "--map", "A"], "is not an id"),
@@ -327,3 +328,62 @@ def test_a_server_keeps_its_maps_in_the_users_state_folder_unless_told_otherwise
         monkeypatch.setenv("XDG_STATE_HOME", relative)
         monkeypatch.setenv("HOME", str(tmp_path))
         assert _store(capsys) == str(tmp_path / ".local" / "state" / "potserver" / "potserver")
+
+
+@pytest.mark.parametrize(
+    ("words", "usage"),
+    [
+        (["serve", "--bogus"], "serve"),
+        (["map"], "map"),
+        (["map", "info", "x", "--bogus"], "map info"),
+        (["map", "merge"], "map merge"),
+        (["atoms", "info", "--bogus"], "atoms info"),
+        (["atoms", "build", "--bogus", "-o", "x"], "atoms build"),
+        (["config", "show", "--bogus"], "config show"),
+        (["eval", "x", "--bogus"], "eval"),
+        (["demo", "--bogus"], "demo"),
+    ],
+)
+def test_a_word_that_a_verb_does_not_know_is_answered_with_its_own_usage(
+    words: list[str], usage: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as ended:
+        cli.main(words)
+    assert ended.value.code == 2
+    err = capsys.readouterr().err
+    assert err.startswith(f"usage: potserver {usage} [-h]")
+    assert err.splitlines()[-1].startswith(f"potserver {usage}: error: ")
+
+
+def test_the_version_is_told(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        cli.main(["--version"])
+    assert ended.value.code == 0
+    assert capsys.readouterr().out == f"potserver {__version__}\n"
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (["eval", "nowhere", "--json", "{}/absent/x.json"], "cannot write"),
+        (["eval", "nowhere", "--markdown", "{}/absent/x.md"], "cannot write"),
+        (["map", "export", "nowhere", "-f", "ply", "-o", "{}/absent/x.ply"], "cannot write"),
+        (["map", "import", "nowhere", "-o", "{}"], "it is a folder"),
+        (["map", "merge", "nowhere", "nowhere", "-o", "{}/file/x.map"], "file is no folder"),
+        (["atoms", "export", "nobody", "-o", "{}/file"], "it is no folder"),
+        (["atoms", "import", "nowhere", "-o", "{}/absent/x.atoms"], "cannot write"),
+        (["atoms", "build", "nowhere", "-o", "{}/absent/x.atoms"], "cannot write"),
+        (["atoms", "info", "nowhere", "--picture", "{}/absent/x.png"], "cannot write"),
+        (["atoms", "info", "nowhere", "--picture", "{}/x.txt"], "a picture ends in .png, .pdf, .svg, .jpg"),
+        (["demo", "nowhere", "--out", "{}/file"], "it is no folder"),
+    ],
+)
+def test_what_cannot_be_written_is_one_line_before_the_work(
+    tmp_path: Path, words: list[str], told: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "file").write_text("")
+    assert cli.main([word.format(tmp_path) for word in words]) == 2
+    err = capsys.readouterr().err
+    assert err.startswith("potserver: cannot ")
+    assert told in err
+    assert err.count("\n") == 1

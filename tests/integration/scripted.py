@@ -32,6 +32,8 @@ class ScriptedServer:
     def __init__(self, *, ready: bool = True) -> None:
         self.endpoint = f"tcp/127.0.0.1:{free_port()}"
         self.keys = MapKeys("pot/v1", "default")
+        self._token: zenoh.LivelinessToken | None = None
+        self.n_left = 0  # how often the token went
         self.asked: list[tuple[str, bytes]] = []  # operation or verb, and the question, as they came
         self._held: list[zenoh.Query] = []
         self._declared: list[Any] = []
@@ -47,7 +49,13 @@ class ScriptedServer:
     def declare_ready(self) -> None:
         """Say that the map is served and warm."""
         key = self.keys.server_token("scripted")
-        self._declared.append(self.session.liveliness().declare_token(key))
+        self._token = self.session.liveliness().declare_token(key)
+
+    def leave(self) -> None:
+        """Say that the map is served no more; clouds and questions are taken all the same."""
+        self.n_left += 1
+        assert self._token is not None
+        self._token.undeclare()
 
     def on(self, op: str, *answers: Answer) -> None:
         """Answer `q/<op>`, or `ctl/<op>` for a verb.

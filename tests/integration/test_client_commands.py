@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import threading
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -17,11 +18,12 @@ from potclient.cli import main
 from potclient.client import MapClient
 from potclient.errors import NoServerError
 from potclient.kernels import KernelSet
+from potschemas.messages import Cloud, ErrorCode, Receipt
 from potserver.server import MapServer
 
 from .conftest import DEADLINE_S
 from .rooms import pose, room
-from .scripted import ScriptedServer, free_port
+from .scripted import ScriptedServer, free_port, receipt_of
 
 Run = Callable[..., tuple[int, str, str]]
 CORNERS = ("--lower", "-2", "-2", "-2", "--upper", "2", "2", "2")
@@ -69,11 +71,6 @@ def run(run_at: Run, map_server: MapServer, map_client: MapClient) -> Run:
         (["mirror", "--lower", "0", "0", "0"], "both corners"),
         (["mirror", "--lower", "0", "0", "0", "--upper", "1", "-1", "1"], "above upper"),
         (["mirror", "--mantissa-bits", "24"], "2 to 23"),
-        (["atoms", "-o", "x.atom"], "-o saves the atom"),
-        (["atoms", "list", "a"], "potclient atoms get a"),
-        (["atoms", "get"], "one ID"),
-        (["atoms", "add"], "name FILEs"),
-        (["atoms", "remove"], "name IDs"),
         (["atoms", "add", "/nonexistent.atom"], "No such file"),
         (["info", "--map", "No Way"], "not an id"),
         (["info", "--cfg", "nonsense"], "KEY:VALUE"),
@@ -110,11 +107,6 @@ def test_mistakes_are_one_clear_line_and_status_2(run: Run, words: list[str], me
         (["export", "bt", "-o", "x", "--resolution", "1", "--band", "0", "1"], "--lower"),
         (["query", "1e9", "0", "0"], "out_of_range"),
         (["map", "load", "elsewhere"], "elsewhere"),
-        (["map", "load"], "name a saved map"),
-        (["map", "merge"], "name a saved map"),
-        (["map", "forget"], "name a robot"),
-        (["map", "clear", "here"], "clear takes no name"),
-        (["map", "load", "here", "--pose", "0", "0", "0", "0"], "load takes no pose"),
         (["info", "--map", "other", "--wait", "0.05"], "maps served here: default"),
     ],
 )
@@ -134,11 +126,40 @@ def test_no_server_is_status_1_with_a_hint(run_at: Run) -> None:
     assert err.count("\n") == 1
 
 
-def test_unwritable_files_are_one_line(run: Run, tmp_path: Path) -> None:
-    status, _, err = run("query", "1", "2", "3", "-o", str(tmp_path / "absent" / "x.npz"))
-    assert status == 1
-    assert "No such file" in err
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["query", "1", "2", "3", "-o", "{}/absent/x.npz"],
+        ["query", "1", "2", "3", "--json", "{}/absent/x.json"],
+        ["query", "1", "2", "3", "-o", "{}"],
+        ["grid", "--resolution", "1", "-o", "{}/absent/x.npz"],
+        ["grid", "--resolution", "1", "--png", "{}/absent/x.png"],
+        ["rays", "0", "0", "1", "-o", "{}/absent/x.npz"],
+        ["risk", "--path", "absent.txt", "--sphere", "0", "0", "0", "1", "--json", "{}/absent/x.json"],
+        ["export", "ply", "-o", "{}/absent/x.ply"],
+        ["mirror", "--once", "-o", "{}/absent/x.npz"],
+        ["atoms", "get", "a", "-o", "{}/absent/a.atom"],
+        ["atoms", "--json", "{}/absent/a.json"],
+        ["publish", "generated", "--json", "{}/absent/x.json"],
+        ["load", "--json", "{}/absent/x.json"],
+        ["info", "--json", "{}/absent/x.json"],
+    ],
+)
+def test_unwritable_files_are_one_line_before_anything_is_asked(
+    run_at: Run, tmp_path: Path, words: list[str]
+) -> None:
+    nobody = f"tcp/127.0.0.1:{free_port()}"
+    status, out, err = run_at(nobody, *(word.format(tmp_path) for word in words))
+    assert (status, out) == (2, "")
+    assert err.startswith(f"potclient: cannot write {tmp_path}")
     assert err.count("\n") == 1
+
+
+def test_a_picture_of_no_known_kind_is_one_line_before_the_question(run_at: Run, tmp_path: Path) -> None:
+    nobody = f"tcp/127.0.0.1:{free_port()}"
+    status, _, err = run_at(nobody, "grid", "--resolution", "1", "--png", str(tmp_path / "z.txt"))
+    assert status == 2
+    assert err == f"potclient: cannot draw {tmp_path / 'z.txt'}: a picture ends in .png, .pdf, .svg, .jpg\n"
 
 
 # --- publish -------------------------------------------------------------------------------------------------------
@@ -178,6 +199,88 @@ def test_publish_fails_if_a_scan_has_no_receipt(run_at: Run) -> None:
         )
     assert status == 1
     assert "2 unknown" in out
+
+
+def test_held_out_beams_beyond_the_servers_range_are_told_with_the_flag_that_helps(run: Run) -> None:
+    words = ("publish", "generated", "--limit", "3", "--hold-out", "0.2", "-q", "--clear")
+    status, _, err = run(*words)
+    assert status == 0
+    (line,) = [line for line in err.splitlines() if "beyond" in line]
+    found = re.match(r"(\d+\.\d)% of the held-out beams end beyond the server's range of 12 m", line)
+    assert found is not None
+    assert 0.0 < float(found[1]) < 100.0
+    assert "--max-range 12" in line
+    assert "beyond" not in run(*words, "--max-range", "12")[2]
+
+
+@pytest.mark.parametrize("how", [[], ["--acknowledged"], ["--json", "-"]])
+def test_a_quiet_publish_still_says_why_scans_were_refused(run: Run, how: list[str]) -> None:
+    words = ("publish", "generated:2d", "--limit", "3", "--keep-stamps", "--robot", f"quiet{len(how)}", "-q")
+    status, _, err = run(*words)
+    assert status == 0
+    assert "not accepted" not in err
+    status, _, err = run(*words, *how)
+    assert status == 1
+    (line,) = [line for line in err.splitlines() if "not accepted" in line]
+    assert line.startswith("not accepted: 3 old_stamp (the stamp is ")
+
+
+@pytest.mark.parametrize("how", [[], ["--drop", "--rate", "50"]])
+def test_publish_ends_soon_after_its_server_died(
+    run_at: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, how: list[str]
+) -> None:
+    monkeypatch.setattr("potclient.commands.publish.GONE_S", 0.5)
+    target = tmp_path / "report.json"
+    server, n_clouds = ScriptedServer(), 0
+
+    def die_at_the_third(robot: str, cloud: Cloud) -> Receipt | None:
+        nonlocal n_clouds
+        n_clouds += 1
+        if n_clouds == 3:
+            threading.Thread(target=server.close).start()
+        return receipt_of(robot, cloud) if n_clouds < 3 else None
+
+    server.on_clouds(die_at_the_third)
+    started = time.monotonic()
+    words = ("publish", "generated:2d", "-q", "--hold-out", "0.2", "--json", str(target), *how)
+    status, out, err = run_at(server.endpoint, *words)
+    assert time.monotonic() - started < 10.0
+    assert status == 1
+    assert "the server is gone; waiting for it for 0.5 s" in err
+    assert re.search(r"the server was gone for 0\.5 s; \d+ of \d+ scans had been sent", err.splitlines()[-1])
+    assert re.search(r"^2 of \d+ scans accepted", out)
+    report = json.loads(target.read_text())
+    assert report["counts"]["accepted"] == 2
+    assert "the server was gone" in report["failure"]
+
+
+def test_publish_goes_on_when_its_server_is_back(run_at: Run) -> None:
+    with ScriptedServer() as server:
+
+        def leave_and_return(robot: str, cloud: Cloud) -> Receipt:
+            if server.n_left == 0:
+                server.leave()
+                threading.Timer(0.5, server.declare_ready).start()
+            return receipt_of(robot, cloud)
+
+        server.on_clouds(leave_and_return)
+        words = ("publish", "generated:2d", "--limit", "12", "--rate", "10")
+        status, out, err = run_at(server.endpoint, *words)
+    assert status == 0
+    assert "12 of 12 scans accepted" in out
+    assert err.index("the server is gone") < err.index("the server is back")
+
+
+def test_a_score_that_cannot_be_had_does_not_take_the_report_along(run_at: Run) -> None:
+    with ScriptedServer() as server:
+        server.on_clouds(receipt_of)
+        server.on("info", ErrorCode.INTERNAL)
+        status, out, err = run_at(
+            server.endpoint, "publish", "generated:2d", "--limit", "2", "--hold-out", "0.2"
+        )
+    assert status == 1
+    assert "2 of 2 scans accepted" in out
+    assert "internal" in err
 
 
 @pytest.mark.parametrize(("error", "status"), [(KeyboardInterrupt(), 130), (NoServerError("gone"), 1)])
@@ -312,9 +415,15 @@ def test_info_and_atoms(run: Run, map_client: MapClient, tmp_path: Path) -> None
     status, out, _ = run("info", "--stats")
     assert status == 0
     assert re.search(r"^server +potserver$", out, re.MULTILINE)
-    assert "stats.uptime_s" in out
-    status, out, _ = run("info", "--json", "-")
-    assert json.loads(out)["server"] == "potserver"
+    assert re.search(r"^stats\.uptime_s +\d\d:\d\d:\d\d$", out, re.MULTILINE)
+    assert re.search(r"^started_ns +20\d\d-\d\d-\d\dT\d\d:\d\d:\d\dZ$", out, re.MULTILINE)
+    assert re.search(r"^stats\.rss_bytes +\d+\.\d [MG]iB$", out, re.MULTILINE)
+    assert re.search(r"^limits\.max_cloud_bytes +\d+\.\d MiB$", out, re.MULTILINE)
+    status, out, _ = run("info", "--stats", "--json", "-")
+    tree = json.loads(out)
+    assert tree["server"] == "potserver"
+    assert tree["started_ns"] > 10**18, "JSON keeps the numbers"
+    assert tree["stats"]["rss_bytes"] > 2**20
     listed = map_client.atoms()
     atom, n = listed[0].atom_id, len(listed)
     status, out, _ = run("atoms")
@@ -325,6 +434,8 @@ def test_info_and_atoms(run: Run, map_client: MapClient, tmp_path: Path) -> None
     assert status == 0
     assert "source: " in out
     assert len(Atom.load(tmp_path / "wall.atom").kernels) == listed[0].n_kernels
+    status, out, _ = run("atoms", "list")
+    assert (status, out.count("\n")) == (0, n + 1)
     status, out, _ = run("atoms", "remove", atom)
     assert (status, out) == (0, f"{atom} removed, {n - 1} atoms, until the server restarts\n")
     status, out, _ = run("atoms", "add", str(tmp_path / "wall.atom"), "--json", "-")

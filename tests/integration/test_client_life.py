@@ -5,6 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 import threading
+from typing import Any
 
 import pytest
 import zenoh
@@ -19,7 +20,7 @@ from potschemas.keys import MapKeys
 from potserver.config import load_settings
 from potserver.server import MapServer
 
-from .conftest import DEADLINE_S
+from .conftest import DEADLINE_S, in_background
 from .rooms import pose, room
 from .scripted import free_port
 
@@ -82,6 +83,50 @@ def test_a_server_that_goes_away_and_comes_back() -> None:
             assert client.info().n_scans == 1
     finally:
         client.close()
+
+
+def test_a_server_that_warms_up_is_said_to_do_so(make_rig: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("potclient.link._DIAGNOSIS_TIMEOUT_S", 0.05)
+    rig = make_rig(start=False)
+    rig.mapper.warming.hold()
+    started = in_background(rig.server.start)
+    rig.mapper.warming.wait_entered()
+    with MapClient(rig.server.endpoint) as client:
+        with pytest.raises(NoServerError, match="warming up"):
+            client.info()
+        with pytest.raises(NoServerError, match="warming up"):
+            client.integrate(room(), pose())
+        with pytest.raises(NoServerError, match="warming up"):
+            client.wait_ready(0.01)
+        rig.mapper.warming.release()
+        started()
+        client.wait_ready(DEADLINE_S)
+        assert client.info().server == "potserver"
+
+
+def test_a_question_at_the_end_of_the_warm_up_is_not_laid_on_access_control(
+    make_rig: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("potclient.link._DIAGNOSIS_TIMEOUT_S", DEADLINE_S)
+    rig = make_rig(start=False)
+    rig.mapper.warming.hold()
+    started = in_background(rig.server.start)
+    rig.mapper.warming.wait_entered()
+    silent, diagnose = threading.Event(), Link._silence
+
+    def diagnosed(*arguments: Any) -> Any:
+        silent.set()
+        return diagnose(*arguments)
+
+    monkeypatch.setattr(Link, "_silence", diagnosed)
+    with MapClient(rig.server.endpoint) as client:
+        asked = in_background(client.info)
+        assert silent.wait(DEADLINE_S)
+        rig.mapper.warming.release()
+        started()
+        with pytest.raises(NoServerError, match="it was warming up, ask again") as caught:
+            asked()
+        assert caught.value.retryable
 
 
 # --- lanes ---------------------------------------------------------------------------------------------------------

@@ -34,9 +34,11 @@ def test_a_robot_drives_and_a_planner_asks(map_server: MapServer, map_client: Ma
     assert "3 of 3 published scans accepted, 0 unknown" in out
     assert map_client.info().n_scans == 4
     out = run("planner.py", "--connect", map_server.endpoint)
-    assert re.search(r"P\(occupied\) 0\.\d+", out)
+    assert re.search(r"P\(occupied\) 0\.\d+, sd 0\.\d+, observed", out), "it asks where the map knows"
     assert out.count("degrees: ") == 8
     assert "a collision with probability" in out
+    out = run("planner.py", "--connect", map_server.endpoint, "--at", "500", "0", "0")
+    assert re.search(r"500.*P\(occupied\) 0\.50, sd 0\.\d+, unknown", out)
 
 
 def test_a_notebook_maps_in_its_own_process() -> None:

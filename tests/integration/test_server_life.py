@@ -197,6 +197,68 @@ def test_a_taken_port_is_one_clear_line(make_rig: MakeRig) -> None:
     client.close()
 
 
+def test_a_second_server_of_a_map_is_refused(make_rig: MakeRig, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("potserver.adapters.presence.GONE_S", 0.5)
+    first = make_rig(server_id="first")
+    joins = [first.server.endpoint]
+    second = make_rig(start=False, server_id="second", maps=["default", "roof"], zenoh__connect=joins)
+    with pytest.raises(SettingsError, match=r"'default'.*'pot/v1'.*by first.*--map.*--root.*stop") as caught:
+        second.server.start()
+    assert "\n" not in str(caught.value)
+    client = Client(joins[0])
+    assert client.alive(f"@{ROOT}/srv/*/*") == [client.keys.server_token("first")]
+    assert client.one("integrate", make_cloud(robot="r1")).map_revision == 1
+    assert first.mapper.n_scans == 1
+    client.close()
+
+
+@pytest.mark.parametrize("changes", [{"maps": ["roof"]}, {"root": "pot/other"}])
+def test_servers_of_other_maps_or_roots_share_a_network(
+    make_rig: MakeRig, changes: dict[str, object]
+) -> None:
+    first = make_rig()
+    make_rig(zenoh__connect=[first.server.endpoint], **changes)
+    client = Client(first.server.endpoint)
+    until(lambda: len(client.alive("@pot/**")) == 2, "both tokens")
+    client.close()
+
+
+def test_a_server_waits_for_the_token_of_one_that_has_just_ended(
+    make_rig: MakeRig, caplog: pytest.LogCaptureFixture
+) -> None:
+    hub = make_rig(maps=["hub"], zenoh__mode="router")
+    joins = [hub.server.endpoint]
+    dying = Client(joins[0])
+    token = dying.session.liveliness().declare_token(dying.keys.server_token("potserver"))
+    next_one = make_rig(start=False, zenoh__connect=joins)
+    started = in_background(next_one.server.start)
+    until(lambda: "map_served_already" in caplog.text, "the server to say so")
+    token.undeclare()
+    started()
+    assert next_one.server.state == "serving"
+    assert caplog.text.count("map_served_already") == 1
+    dying.close()
+
+
+def test_a_server_that_came_up_during_the_warm_up_is_seen(
+    make_rig: MakeRig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("potserver.adapters.presence.GONE_S", 0.2)
+    hub = make_rig(maps=["hub"], zenoh__mode="router")
+    joins = [hub.server.endpoint]
+    slow = make_rig(start=False, server_id="slow", zenoh__connect=joins)
+    slow.mapper.warming.hold()
+    started = in_background(slow.server.start)
+    slow.mapper.warming.wait_entered()
+    make_rig(server_id="quick", zenoh__connect=joins)
+    client = Client(joins[0])
+    until(lambda: client.alive(client.keys.server_token("quick")), "its token at the router")
+    client.close()
+    slow.mapper.warming.release()
+    with pytest.raises(SettingsError, match="by quick"):
+        started()
+
+
 def test_a_failing_start_leaves_nothing_behind(make_rig: MakeRig) -> None:
     rig = make_rig(start=False)
 

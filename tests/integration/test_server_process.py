@@ -106,3 +106,23 @@ def test_a_taken_port_is_one_line_and_exit_code_two(serve: Any) -> None:
     assert "Hint" in line
     process.popen.send_signal(signal.SIGTERM)
     assert process.wait() == 0
+
+
+def test_a_second_server_of_a_map_is_one_line_and_exit_code_two(serve: Any) -> None:
+    _, endpoint = serve()
+    other = ServerProcess(
+        "serve", "--in-memory", "--connect", endpoint, "--listen", "tcp/127.0.0.1:0", "--server-id", "other",
+        "--log-level", "error",
+    )  # fmt: skip
+    assert other.wait() == 2
+    other.close()
+    (line,) = other.lines
+    assert "is served already, by potserver" in line
+
+
+def test_a_server_that_was_killed_starts_again_at_once(serve: Any) -> None:
+    _, hub = serve("--map", "hub", "--mode", "router")
+    for _ in range(2):
+        process, _ = serve("--connect", hub)
+        process.popen.kill()
+        process.wait()

@@ -4,21 +4,21 @@ from __future__ import annotations
 
 import argparse
 import math
-from pathlib import Path
 from typing import Any
 
 from potclient.atoms import Atom
+from potclient.commands.output_files import output_file
 from potclient.commands.shared import (
     EXIT_OK,
     add_command,
     add_json_argument,
+    add_verb,
     client_of,
     plain,
     say,
     table,
     write_json,
 )
-from potclient.errors import UsageError
 from potschemas import messages
 
 
@@ -38,42 +38,55 @@ already, and says why. A file holds one atom; `potserver atoms export` takes the
   potclient atoms add terraces-180-s4.atom corner.atom
   potclient atoms remove terraces-180-s4""",
     )
-    parser.add_argument(
-        "verb", nargs="?", choices=("list", "get", "add", "remove"), default="list", help="default: list"
-    )
-    parser.add_argument(
-        "names", nargs="*", metavar="ID|FILE", help="an ID to get; FILEs to add; IDs to remove"
-    )
-    parser.add_argument(
-        "-o", "--out", type=Path, metavar="FILE", help="get: save the atom (`potclient.Atom.load` reads it)"
-    )
     add_json_argument(parser)
+    verbs = parser.add_subparsers(title="verbs", metavar="VERB", dest="verb")
+    listing = add_verb(
+        verbs, "list", run, help="all atoms; the default",
+        description="List the dictionary's atoms with how often each has served.",
+    )  # fmt: skip
+    get = add_verb(
+        verbs,
+        "get",
+        run,
+        help="one atom whole",
+        description="Fetch one atom whole, and show where it comes from.",
+    )
+    get.add_argument("atom_id", metavar="ID")
+    get.add_argument(
+        "-o",
+        "--out",
+        type=output_file,
+        default=None,
+        metavar="FILE",
+        help="save it (`potclient.Atom.load` reads it)",
+    )
+    put = add_verb(
+        verbs, "add", _change_atoms, help="put atoms into the dictionary",
+        description="Put atoms into the dictionary; each file holds one.",
+    )  # fmt: skip
+    put.add_argument("names", nargs="+", metavar="FILE", help="*.atom")
+    remove = add_verb(
+        verbs, "remove", _change_atoms, help="take atoms out of the dictionary",
+        description="Take atoms out of the dictionary. The kernels that maps have from them stay.",
+    )  # fmt: skip
+    remove.add_argument("names", nargs="+", metavar="ID")
+    for verb in (listing, get, put, remove):
+        add_json_argument(verb)
 
 
 def run(arguments: argparse.Namespace) -> int:
-    verb, names = arguments.verb, arguments.names
-    if verb == "list" and names:
-        raise UsageError(f"atoms: list takes no names; `potclient atoms get {names[0]}` shows one")
-    if verb == "get" and len(names) != 1:
-        raise UsageError("atoms: get needs one ID")
-    if verb in ("add", "remove") and not names:
-        raise UsageError(f"atoms: {verb} what? name {'FILEs' if verb == 'add' else 'IDs'}")
-    if arguments.out is not None and verb != "get":
-        raise UsageError("atoms: -o saves the atom that `get ID` fetches")
-    if verb in ("add", "remove"):
-        return _change_atoms(arguments)
     with client_of(arguments) as client:
-        if verb == "list":
-            atoms = client.atoms()
-        else:
-            atom = client.atom(names[0])
+        if arguments.verb == "get":
+            atom = client.atom(arguments.atom_id)
             atoms = [atom.info]
             if arguments.out is not None:
                 atom.save(arguments.out)
+        else:
+            atoms = client.atoms()
     write_json(arguments.json, [plain(atom) for atom in atoms])
     if arguments.json != "-":
         _say_atoms(atoms)
-        if verb == "get":
+        if arguments.verb == "get":
             say("\n".join(f"{key}: {value}" for key, value in sorted(atoms[0].provenance.items())))
     return EXIT_OK
 

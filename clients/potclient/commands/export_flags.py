@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 
 from potclient import export
+from potclient.commands.output_files import output_file
 from potclient.commands.shared import EXIT_OK, add_box_arguments, note, part_bar, positive, say
 from potclient.errors import UsageError
 
@@ -14,7 +14,7 @@ EXPORT_KINDS = ("ply", "npz", "pgm", "bt")
 
 def add_export_flags(parser: argparse.ArgumentParser) -> None:
     """The flags that say what of a map goes into a file, and how; `export_map` reads them."""
-    parser.add_argument("-o", "--out", type=Path, required=True, metavar="FILE", help="file to write")
+    parser.add_argument("-o", "--out", type=output_file, required=True, metavar="FILE", help="file to write")
     add_box_arguments(parser, "corner of the box (default: the map's)")
     parser.add_argument("--resolution", type=positive, metavar="METRES", help="pgm, bt: cell edge")
     parser.add_argument(

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from potclient.commands.output_files import output_file, picture_file
 from potclient.commands.shared import (
     EXIT_OK,
     add_box_arguments,
@@ -19,7 +19,7 @@ from potclient.commands.shared import (
 )
 from potclient.errors import UsageError
 from potclient.export import bounds_of
-from potclient.pictures import draw_layer
+from potclient.pictures import draw_layer, load_pyplot
 
 
 def add(commands: Any) -> None:
@@ -38,9 +38,15 @@ def add(commands: Any) -> None:
     add_box_arguments(parser, "corner of the box, m, map frame")
     parser.add_argument("--resolution", type=positive, required=True, metavar="METRES", help="cell edge")
     parser.add_argument(
-        "-o", "--out", type=Path, metavar="FILE", help="write an .npz: mean, var, ..., lower, resolution"
+        "-o",
+        "--out",
+        type=output_file,
+        metavar="FILE",
+        help="write an .npz: mean, var, ..., lower, resolution",
     )
-    parser.add_argument("--png", type=Path, metavar="FILE", help="draw mean and uncertainty of one layer")
+    parser.add_argument(
+        "--png", type=picture_file, metavar="FILE", help="draw mean and uncertainty of one layer"
+    )
     parser.add_argument(
         "--level", type=float, metavar="Z", help="layer for --png, m (default: the middle one)"
     )
@@ -50,6 +56,8 @@ def add(commands: Any) -> None:
 def run(arguments: argparse.Namespace) -> int:
     if arguments.out is None and arguments.png is None:
         raise UsageError("grid: nothing to do with the answer; give -o FILE or --png FILE")
+    if arguments.png is not None:
+        load_pyplot()
     with client_of(arguments) as client:
         lower, upper = arguments.lower, arguments.upper
         if lower is None or upper is None:

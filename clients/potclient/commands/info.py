@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import datetime
 from collections.abc import Iterator
 from typing import Any
 
@@ -37,7 +38,7 @@ def run(arguments: argparse.Namespace) -> int:
             tree["stats"] = plain(client.stats(tree["server"]))
     write_json(arguments.json, tree)
     if arguments.json != "-":
-        say(table(["", ""], [[key, _cell(value)] for key, value in _flatten(tree)], rule=False))
+        say(table(["", ""], [[key, _cell(key, value)] for key, value in _flatten(tree)], rule=False))
     return EXIT_OK
 
 
@@ -49,7 +50,29 @@ def _flatten(tree: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]
             yield f"{prefix}{key}", value
 
 
-def _cell(value: Any) -> str:
+def _cell(key: str, value: Any) -> str:
+    """The value in units for people, which the end of its key tells."""
     if isinstance(value, list):
-        return " ".join(_cell(v) for v in value)
+        return " ".join(_cell(key, v) for v in value)
+    if key.endswith("_ns") and isinstance(value, int):
+        return datetime.datetime.fromtimestamp(value // 10**9, datetime.timezone.utc).strftime(
+            "%Y-%m-%dT%H:%M:%SZ"
+        )
+    if key.endswith("bytes") and isinstance(value, int):
+        return _size(value)
+    if key.endswith("uptime_s"):
+        return _duration(value)
     return f"{value:.6g}" if isinstance(value, float) else "-" if value is None else str(value)
+
+
+def _size(n_bytes: int) -> str:
+    for unit, size in (("GiB", 2**30), ("MiB", 2**20), ("KiB", 2**10)):
+        if n_bytes >= size:
+            return f"{n_bytes / size:.1f} {unit}"
+    return f"{n_bytes} B"
+
+
+def _duration(seconds: float) -> str:
+    days, rest = divmod(int(seconds), 86_400)
+    clock = f"{rest // 3600:02d}:{rest // 60 % 60:02d}:{rest % 60:02d}"
+    return f"{days} d {clock}" if days else clock

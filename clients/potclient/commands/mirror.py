@@ -8,9 +8,9 @@ import json
 import threading
 import time
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
+from potclient.commands.output_files import output_file
 from potclient.commands.shared import EXIT_OK, add_box_arguments, add_command, client_of, note, positive, say
 from potclient.errors import LostReplyError, NoServerError, QueryTimeoutError, UsageError
 from potclient.mirror import MapMirror, MirrorUpdate
@@ -44,7 +44,7 @@ move by up to a hundredth, with 10 bits two thirds and a thousandth.""",
     parser.add_argument("--updates", type=int, metavar="N", help="stop after N updates")
     parser.add_argument("--json", action="store_true", help="one JSON object a line")
     parser.add_argument(
-        "-o", "--out", type=Path, metavar="FILE", help="at the end, save the kernels as an .npz"
+        "-o", "--out", type=output_file, metavar="FILE", help="at the end, save the kernels as an .npz"
     )
 
 

@@ -15,8 +15,9 @@ def add_pose_flag(parser: argparse.ArgumentParser) -> None:
         "--pose",
         type=float,
         nargs=4,
+        default=None,
         metavar=("X", "Y", "Z", "YAW"),
-        help="merge: where the origin of the map that is taken in lies in the other, m, and by how many degrees it is turned",
+        help="where the origin of the map that is taken in lies in the other, m, and its yaw in degrees",
     )
 
 

@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import argparse
+import collections
 import contextlib
+import dataclasses
 import sys
+import threading
+import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
 
+from potclient.client import MapClient
 from potclient.commands.shared import (
     EXIT_FAILED,
     EXIT_OK,
@@ -24,10 +29,15 @@ from potclient.commands.shared import (
     say,
     write_json,
 )
+from potclient.errors import NoServerError
 from potclient.feed import FeedOptions
 from potclient.holdout import HoldOut
 from potclient.metrics import Metrics
 from potclient.play import PlayReport, ScanOutcome, Sending, play
+
+# For a server that went away in the middle: longer than its drain takes by default, and than a restart.
+GONE_S = 20.0
+_LOOK_S = 0.1
 
 
 def add(commands: Any) -> None:
@@ -36,8 +46,8 @@ def add(commands: Any) -> None:
         "publish",
         run,
         help="play a recording into the map, one receipt a scan",
-        description="""Play a recording into the map. Every scan is sent and its receipt shown; the exit status is 1 if any
-scan has no receipt or was not accepted.
+        description=f"""Play a recording into the map. Every scan is sent and its receipt shown; the exit status is 1 if any
+scan has no receipt or was not accepted. A server that goes away meanwhile has {GONE_S:g} s to come back.
 
 DATASET is found out by looking at it:
   a folder with velodyne/*.bin      KITTI odometry, with poses.txt and calib.txt
@@ -73,7 +83,12 @@ DATASET is found out by looking at it:
     parser.add_argument(
         "--receipt-timeout", type=positive, default=30.0, metavar="SECONDS", help="default 30"
     )
-    parser.add_argument("-q", "--quiet", action="store_true", help="only the summary")
+    parser.add_argument(
+        "-q",
+        "--quiet",
+        action="store_true",
+        help="no line a scan; reasons are summed up",
+    )
     add_json_argument(parser)
 
 
@@ -108,12 +123,14 @@ def run(arguments: argparse.Namespace) -> int:
         acknowledged=arguments.acknowledged,
         keep_stamps=arguments.keep_stamps,
     )
-    with client_of(arguments, FeedOptions(receipt_timeout_s=arguments.receipt_timeout)) as client:
+    feed = FeedOptions(receipt_timeout_s=arguments.receipt_timeout)
+    with client_of(arguments, feed) as client:
         client.wait_ready()
         note(f"{recording.path}: {len(recording)} scans ({recording.format}); {'; '.join(recording.notes)}")
         if arguments.clear:
             note(client.control("clear").message)
-        with _scan_progress(len(recording), quiet=arguments.quiet) as on_outcome:
+        watch = _ServerWatch(client)
+        with watch, _scan_progress(len(recording), quiet=arguments.quiet) as on_outcome:
             report = play(
                 client,
                 recording,
@@ -122,12 +139,59 @@ def run(arguments: argparse.Namespace) -> int:
                 max_test_points=arguments.max_test,
                 on_outcome=on_outcome,
             )
+    if watch.has_given_up:
+        sent = f"{len(report.scans)} of {len(recording)} scans had been sent"
+        failure = NoServerError(f"the server was gone for {GONE_S:g} s; {sent}")
+        report = dataclasses.replace(report, failure=failure)
     write_json(arguments.json, report.to_json())
     if arguments.json != "-":
         _say_play(report)
+    _note_reasons(report)
+    if report.beyond_range > 0 and report.range_m is not None:
+        note(
+            f"{report.beyond_range:.1%} of the held-out beams end beyond the server's range of {report.range_m:g} m, where it"
+            f" maps nothing: cut them with --max-range {report.range_m:g}, or start the server with"
+            " --set mapping.max_range_m=METRES"
+        )
     if report.failure is not None:
         raise report.failure
     return EXIT_OK if report.all_accepted else EXIT_FAILED
+
+
+class _ServerWatch:
+    """Says when nobody serves the map any more, and closes the client when that lasts: its waits end then.
+
+    Made when a server is ready.
+    """
+
+    def __init__(self, client: MapClient) -> None:
+        self.has_given_up = False
+        self._client = client
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="potclient-server-watch", daemon=True)
+
+    def __enter__(self) -> _ServerWatch:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._ended.set()
+        self._thread.join()
+
+    def _run(self) -> None:
+        gone_since: float | None = None
+        while not self._ended.wait(_LOOK_S):
+            if self._client.servers:
+                if gone_since is not None:
+                    note("the server is back")
+                gone_since = None
+            elif gone_since is None:
+                gone_since = time.monotonic()
+                note(f"the server is gone; waiting for it for {GONE_S:g} s")
+            elif time.monotonic() - gone_since > GONE_S:
+                self.has_given_up = True
+                self._client.close()
+                return
 
 
 def _say_play(report: PlayReport) -> None:
@@ -145,6 +209,15 @@ def _say_play(report: PlayReport) -> None:
     say(", ".join(parts) + f", {report.elapsed_s:.1f} s")
     if report.held_out is not None:
         say(f"held-out beams: {_metrics_line(report.held_out)} ({report.n_held_out} points held out)")
+
+
+def _note_reasons(report: PlayReport) -> None:
+    """Why scans were not accepted: how many for each reason, and what the server said of the first."""
+    refused = [scan for scan in report.scans if scan.reason is not None]
+    counts = collections.Counter(scan.reason for scan in refused)
+    first = {scan.reason: scan.message for scan in reversed(refused)}
+    if counts:
+        note("not accepted: " + ", ".join(f"{n} {reason} ({first[reason]})" for reason, n in counts.items()))
 
 
 def _metrics_line(m: Metrics) -> str:

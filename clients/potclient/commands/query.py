@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from potclient.arrays import Float64
+from potclient.commands.output_files import output_file
 from potclient.commands.shared import (
     EXIT_OK,
     add_command,
@@ -46,7 +47,7 @@ log-odds with theirs, and whether the map has seen anything near: unknown is 0.5
         "--file", type=Path, metavar="FILE", help=".npy of shape (N, 3) or (N, 2), or text rows of x y z"
     )
     parser.add_argument("--gradient", action="store_true", help="gradients of probability and log-odds too")
-    parser.add_argument("-o", "--out", type=Path, metavar="FILE", help="write all answers to an .npz")
+    parser.add_argument("-o", "--out", type=output_file, metavar="FILE", help="write all answers to an .npz")
     add_json_argument(parser)
 
 

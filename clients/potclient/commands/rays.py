@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from potclient.arrays import Float64
+from potclient.commands.output_files import output_file
 from potclient.commands.shared import (
     EXIT_OK,
     add_command,
@@ -65,7 +66,7 @@ constant P stops the ray with probability P. Ranges are of the first return, or 
         "--width", type=positive, metavar="METRES", help="over which P is one trial (default: the kernels')"
     )
     parser.add_argument("--step", type=positive, metavar="METRES", help="of the summation (default: fine)")
-    parser.add_argument("-o", "--out", type=Path, metavar="FILE", help="write all answers to an .npz")
+    parser.add_argument("-o", "--out", type=output_file, metavar="FILE", help="write all answers to an .npz")
     add_json_argument(parser)
 
 

@@ -46,13 +46,16 @@ The robot covers cells of a lattice: all whose centres lie in a sphere, and thos
 likeliest of them, as if all were one trial; "union" takes cells further apart than the correlation length as independent. The
 truth lies between "max" and the sum over all cells. Poses count as they are: nothing is covered between them.
 
-The path is a text file with, in each row, x y z, or x y z yaw (radians), or the 12 numbers of a 3x4 matrix, row by row.""",
+The path is a text file with, in each row, x y z, or x y z yaw with the yaw in radians, or the 12 numbers of a
+3x4 matrix, row by row.""",
         epilog="""examples:
   potclient risk --path path.txt --sphere 0 0 0.3 0.35
   potclient risk --path poses.txt --sphere 0.3 0 0.4 0.4 --sphere -0.3 0 0.4 0.4 --unknown prior
   potclient risk --path path.txt --sphere 0 0 0 0.3 --2d --json risk.json""",
     )
-    parser.add_argument("--path", type=Path, required=True, metavar="FILE", help="poses; .npy, or text rows")
+    parser.add_argument(
+        "--path", type=Path, required=True, metavar="FILE", help="poses, m and rad; .npy, or text rows"
+    )
     parser.add_argument(
         "--sphere",
         type=float,

@@ -16,6 +16,7 @@ import numpy as np
 
 from potclient.arrays import Float64
 from potclient.client import MapClient
+from potclient.commands.output_files import text_file
 from potclient.datasets import FORMATS, FRAMES, Recording, open_dataset
 from potclient.errors import UsageError
 from potclient.feed import FeedOptions
@@ -36,25 +37,51 @@ def add_command(
 ) -> Any:
     """A command that asks a server: its parser, with the flags of the map, the time-out and the Zenoh session."""
     parser = commands.add_parser(name, formatter_class=argparse.RawDescriptionHelpFormatter, **texts)
+    parser.set_defaults(command=run, map="default", root=DEFAULT_ROOT, timeout=timeout_s)
+    _add_server_arguments(parser, timeout_s)
+    return parser
+
+
+def add_verb(
+    verbs: Any, name: str, run: Callable[[argparse.Namespace], int], *, timeout_s: float = 10.0, **texts: str
+) -> Any:
+    """A verb of a command that `add_command` made: its parser, with the same flags, which may stand before the verb too.
+
+    Args:
+        verbs: What the command's `add_subparsers` returned.
+        name: Of the verb.
+        run: Takes the parsed flags, returns the exit status.
+        timeout_s: The command's, for the help.
+        texts: `help`, `description` and `epilog`.
+    """
+    parser = verbs.add_parser(
+        name,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        argument_default=argparse.SUPPRESS,  # the command's defaults hold
+        **texts,
+    )
     parser.set_defaults(command=run)
+    _add_server_arguments(parser, timeout_s)
+    return parser
+
+
+def _add_server_arguments(parser: argparse.ArgumentParser, timeout_s: float) -> None:
     group = parser.add_argument_group("server")
-    group.add_argument("--map", default="default", metavar="ID", help="id of the map (default: default)")
-    group.add_argument("--root", default=DEFAULT_ROOT, help=f"root of all keys (default {DEFAULT_ROOT})")
+    group.add_argument("--map", metavar="ID", help="id of the map (default: default)")
+    group.add_argument("--root", help=f"root of all keys (default {DEFAULT_ROOT})")
     group.add_argument(
-        "--timeout",
-        type=positive,
-        default=timeout_s,
-        metavar="SECONDS",
-        help=f"of one answer (default {timeout_s:g})",
+        "--timeout", type=positive, metavar="SECONDS", help=f"of one answer (default {timeout_s:g})"
     )
     add_zenoh_arguments(parser)
-    return parser
 
 
 def add_json_argument(parser: argparse.ArgumentParser) -> None:
     """Add `--json FILE`."""
     parser.add_argument(
-        "--json", metavar="FILE", help="write everything as JSON; - is stdout, instead of text"
+        "--json",
+        type=text_file,
+        metavar="FILE",
+        help="write everything as JSON; - is stdout, instead of text",
     )
 
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import argparse
 import sys
-from pathlib import Path
 from typing import Any
 
+from potclient.commands.output_files import new_folder
 from potclient.commands.shared import EXIT_OK, positive, progress_bar, say
 from potclient.errors import UsageError
 from potclient.towns import PERIOD_S, TownName, open_town
@@ -58,7 +58,9 @@ Other commands take towns as they are, as the dataset town:STYLE[:2d][:dynamic][
         metavar="METRES",
         help="beams beyond are free up to here and have no echo",
     )
-    parser.add_argument("-o", "--out", type=Path, required=True, metavar="FOLDER", help="new folder to write")
+    parser.add_argument(
+        "-o", "--out", type=new_folder, required=True, metavar="FOLDER", help="new folder to write"
+    )
     parser.add_argument("-q", "--quiet", action="store_true", help="no progress bar")
 
 

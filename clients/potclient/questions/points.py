@@ -38,7 +38,8 @@ class PointsQuestion:
         queries = np.ascontiguousarray(as_points(points), dtype)
         if len(queries) == 0:
             return Occupancy.empty(with_gradient=with_gradient)
-        step = len(queries) if len(queries) <= _SPLIT_ABOVE else self._points_a_question(queries.itemsize * 3)
+        may_fit = len(queries) <= _SPLIT_ABOVE and self.limits is None
+        step = len(queries) if may_fit else self._points_a_question(queries.itemsize * 3)
         chunks = [queries[i : i + step] for i in range(0, len(queries), step)]
         if len(chunks) == 1:
             reply = next(self._ask(queries, with_gradient, timeout_s))
