@@ -12,7 +12,7 @@ import pytest
 import zenoh
 
 from potschemas import messages, wire
-from potschemas.keys import stats_key
+from potschemas.keys import MapKeys, stats_key
 from potschemas.messages import ErrorCode, ReceiptStatus
 from potserver.adapters.stats import PERIOD_S
 from potserver.domain.running_scores import RunningScores
@@ -251,9 +251,11 @@ def test_a_server_that_came_up_during_the_warm_up_is_seen(
     started = in_background(slow.server.start)
     slow.mapper.warming.wait_entered()
     make_rig(server_id="quick", zenoh__connect=joins)
-    client = Client(joins[0])
-    until(lambda: client.alive(client.keys.server_token("quick")), "its token at the router")
-    client.close()
+    session, token = slow.server._session, MapKeys(ROOT, "default").server_token("quick")
+    assert session is not None
+    until(
+        lambda: [r for r in session.liveliness().get(token, timeout=DEADLINE_S) if r.ok], "its token at slow"
+    )
     slow.mapper.warming.release()
     with pytest.raises(SettingsError, match="by quick"):
         started()
