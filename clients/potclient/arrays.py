@@ -15,6 +15,7 @@ from potschemas.wire import WireError, decode_array
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
+Floats = NDArray[np.floating[Any]]  # of either width
 Bool = NDArray[np.bool_]
 
 

@@ -144,6 +144,22 @@ def test_clouds_in_the_world_frame_come_back_to_their_sensor(tmp_path: Path) -> 
     np.testing.assert_allclose(sensor.T_map_sensor[:3, 3], [1, 2, 0.5])
 
 
+@pytest.mark.parametrize("data", ["binary", "ascii"])
+def test_world_coordinates_in_doubles_keep_their_millimetres(tmp_path: Path, data: str) -> None:
+    at = np.array([691_000.0, 5_334_000.0, 520.0])  # UTM
+    world = at + np.random.default_rng(0).uniform(-20, 20, (200, 3))
+    head = pcd(np.zeros((200, 3), np.float32), data=data, viewpoint=" ".join(map(str, at)) + " 1 0 0 0")
+    head = head[: head.index(b"DATA")].replace(b"x y z intensity", b"x y z").replace(b"4 4 4 4", b"8 8 8")
+    head = head.replace(b"F F F F", b"F F F").replace(b"1 1 1 1", b"1 1 1") + f"DATA {data}\n".encode()
+    rows = world.astype("<f8").tobytes() if data == "binary" else "\n".join(
+        " ".join(f"{v:.6f}" for v in row) for row in world
+    ).encode()  # fmt: skip
+    (tmp_path / "utm.pcd").write_bytes(head + rows)
+    scan = open_dataset(tmp_path / "utm.pcd")[0]
+    assert scan.points.dtype == np.float32
+    np.testing.assert_allclose(scan.in_map, world, rtol=0, atol=1e-5)
+
+
 def test_a_viewpoint_with_a_rotation(tmp_path: Path) -> None:
     half = math.sqrt(0.5)
     (tmp_path / "a.pcd").write_bytes(pcd(POINTS, viewpoint=f"1 0 0 {half} 0 0 {half}"))
@@ -266,6 +282,29 @@ def test_a_truncated_bin_is_named(kitti: Path) -> None:
         recording[1]
 
 
+def test_sweeps_of_nuscenes_have_five_numbers_a_point(kitti: Path) -> None:
+    points = np.column_stack([np.full((8, 3), 5.0), np.full(8, 77.0), np.arange(8.0)]).astype("<f4")
+    (kitti / "velodyne" / "000001.bin").rename(kitti / "velodyne" / "000001.pcd.bin")
+    points.tofile(kitti / "velodyne" / "000001.pcd.bin")  # 160 bytes: whole points of four numbers too
+    np.testing.assert_array_equal(open_dataset(kitti)[1].points, points[:, :3])
+    (kitti / "velodyne" / "000001.pcd.bin").write_bytes(points.tobytes()[:-4])
+    with pytest.raises(DatasetError, match=r"5 float32 \(x y z intensity ring\)"):
+        open_dataset(kitti)[1]
+
+
+@pytest.mark.parametrize("value", ["nan", "inf", "1e30"])
+def test_times_and_places_that_are_none_are_named(kitti: Path, value: str) -> None:
+    n = len(open_dataset(kitti))
+    (kitti / "times.txt").write_text(f"{value}\n" * n)
+    with pytest.raises(DatasetError, match=r"times.*is not a time in seconds"):
+        open_dataset(kitti)
+    (kitti / "times.txt").unlink()
+    if value != "1e30":
+        (kitti / "poses.txt").write_text(f"1 0 0 {value} 0 1 0 0 0 0 1 0\n" * n)
+        with pytest.raises(DatasetError, match=r"poses.*line 1 .*not finite"):
+            open_dataset(kitti)
+
+
 # --- CARMEN --------------------------------------------------------------------------------------------------------
 
 
@@ -364,6 +403,18 @@ def test_compressed_logs_and_other_poses(
         (b"", "no FLASER"),
         (b"FLASER 180 1 2 3\n", "line 1 is not a whole laser line"),
         (b"# ok\nFLASER two 1 2\n", "line 2 is not a whole laser line"),
+        (flaser([], 0, 0, 0, 1.0).encode(), "line 1 .*0 readings"),
+        (flaser([1.0], 0, 0, 0, 1.0).encode(), "line 1 .*1 readings"),
+        (b"FLASER -4 1 2 3 4 5 6 7 8 9 10 11\n", "line 1 .*-4 readings"),
+        (flaser([1.0, 1.0], 0, 0, 0, math.nan).encode(), "line 1 .*nan is not a time"),
+        (flaser([1.0, 1.0], 0, 0, 0, -math.inf).encode(), "line 1 .*inf is not a time"),
+        (flaser([1.0, 1.0], 0, 0, 0, 1e30).encode(), "line 1 .*is not a time"),
+        (flaser([1.0, 1.0], 0, math.nan, 0, 1.0).encode(), "line 1 .*pose is not finite"),
+        (b"ROBOTLASER1 0 nan 3.1 0.01 30 0.1 0 2 1.0 1.0 0 0 0 0 0 0 0 0 0 0 0 0 1.0", "line 1 .*angles"),
+        (
+            b"ROBOTLASER1 0 -1.5 3.1 0.01 30 0.1 0 2 1.0 1.0 -9 0 0 0 0 0 0 0 0 0 0 0 1.0",
+            "line 1 .*remissions",
+        ),
         (b"BZh9 damaged", "a.log"),
         (b"\x1f\x8b damaged", "a.log"),
     ],

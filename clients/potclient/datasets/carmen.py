@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from potclient.arrays import Float64
-from potclient.datasets.scans import RecordedScan, Recording, growing, read_table
+from potclient.datasets.scans import RecordedScan, Recording, growing, read_table, stamp_of
 from potclient.errors import DatasetError
 from potclient.poses import yaw_pose
 
@@ -28,7 +28,7 @@ class _Line(NamedTuple):
     x_m: float
     y_m: float
     yaw_rad: float
-    stamp_s: float
+    stamp_ns: int
 
 
 class CarmenLog(Recording):
@@ -71,10 +71,12 @@ class CarmenLog(Recording):
                     f"poses: {file} has {len(table)} lines of {table.shape[1]} numbers, need {n} of `x y yaw` or"
                     " `index time x y yaw`"
                 )
+            if not np.isfinite(table[:, -3:]).all():
+                raise DatasetError(f"poses: {file} has a pose that is not finite")
             self._xyt = table[:, -3:]
             note = f"poses from {file.name}"
         self.notes = (note, f"no echo from {no_return_m:g} m on; beams free up to {max_range_m:g} m at most")
-        self._stamps = growing([round(line.stamp_s * 1e9) for line in self._lines])
+        self._stamps = growing([line.stamp_ns for line in self._lines])
 
     def __len__(self) -> int:
         return len(self._lines)
@@ -131,21 +133,32 @@ def _read_lines(path: Path) -> list[_Line]:
 
 def _parse(number: int, words: list[str]) -> _Line:
     if words[0] == "FLASER":
-        n, first = int(words[1]), 2
+        n, first = _count(words[1]), 2
         # 180: one degree up to +89; 181: one degree up to +90
         start, step = -math.pi / 2, math.pi / (n - n % 2)
         pose_at, stamp_at = first + n, first + n + 6
     else:
-        n, first = int(words[8]), 9
+        n, first = _count(words[8]), 9
         start, step = float(words[2]), float(words[4])
+        if not math.isfinite(start) or not math.isfinite(step):
+            raise ValueError("its angles are not finite")
         n_remissions = int(words[first + n])
+        if n_remissions < 0:
+            raise ValueError(f"{n_remissions} remissions")
         pose_at = first + n + 1 + n_remissions
         stamp_at = pose_at + 11  # laser pose, robot pose, five speeds and widths
     ranges = np.asarray(words[first : first + n], np.float64)
-    if n < 2 or len(ranges) != n:
+    if len(ranges) != n:
         raise ValueError(f"{len(ranges)} of {n} readings")
     x, y, yaw = (float(w) for w in words[pose_at : pose_at + 3])
     if not np.isfinite([x, y, yaw]).all():
         raise ValueError("the pose is not finite")
-    stamp = float(words[stamp_at]) if len(words) > stamp_at else number * 0.1
-    return _Line(number, ranges, start, step, x, y, yaw, stamp)
+    stamp_ns = stamp_of(float(words[stamp_at]) if len(words) > stamp_at else number * 0.1)
+    return _Line(number, ranges, start, step, x, y, yaw, stamp_ns)
+
+
+def _count(word: str) -> int:
+    n = int(word)
+    if n < 2:
+        raise ValueError(f"{n} readings; a scan has two or more")
+    return n

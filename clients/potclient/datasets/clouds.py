@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from potclient.arrays import Bool, Float32, Float64
+from potclient.arrays import Bool, Float64, Floats
 from potclient.datasets.scans import RecordedScan, Recording, natural_key, read_poses, read_stamps
 from potclient.errors import DatasetError
 
@@ -77,7 +77,8 @@ class CloudFolder(Recording):
         points, is_return = read_beams(file)
         pose = read_viewpoint(file) if self._poses is None else self._poses[i]
         if self._points_in_world:
-            points = ((points.astype(np.float64) - pose[:3, 3]) @ pose[:3, :3]).astype(np.float32)
+            points = (points.astype(np.float64) - pose[:3, 3]) @ pose[:3, :3]
+        points = points.astype(np.float32)  # only now: world coordinates need doubles
         finite = np.isfinite(points).all(axis=1)
         return RecordedScan(
             points=np.ascontiguousarray(points[finite]),
@@ -94,8 +95,10 @@ def cloud_files(folder: Path) -> list[Path]:
     return sorted((f for f in folder.iterdir() if f.suffix.lower() in (".pcd", ".ply")), key=natural_key)
 
 
-def read_cloud(path: Path) -> Float32:
+def read_cloud(path: Path) -> Floats:
     """(N, 3) m: x, y, z of a PCD (ascii, binary, compressed) or PLY file; NaN where the file says so.
+
+    float32, or float64 where the file has numbers that float32 cannot hold.
 
     Raises:
         DatasetError: not such a file, truncated, or without x y z.
@@ -103,7 +106,7 @@ def read_cloud(path: Path) -> Float32:
     return read_beams(path)[0]
 
 
-def read_beams(path: Path) -> tuple[Float32, Bool]:
+def read_beams(path: Path) -> tuple[Floats, Bool]:
     """(N, 3) m and (N,): the points of a file as `read_cloud`, and whether each is an echo (all are, without `is_return`).
 
     Raises:
@@ -124,7 +127,7 @@ def _is_planar(path: Path) -> bool:
     return is_planar
 
 
-def _read_pcd(path: Path) -> tuple[Float32, Bool]:
+def _read_pcd(path: Path) -> tuple[Floats, Bool]:
     try:
         from pypcd4 import PointCloud
     except ImportError as error:
@@ -141,7 +144,7 @@ def _read_pcd(path: Path) -> tuple[Float32, Bool]:
     return _beams(path, data, tuple(data.dtype.names or ()))
 
 
-def _read_ply(path: Path) -> tuple[Float32, Bool]:
+def _read_ply(path: Path) -> tuple[Floats, Bool]:
     try:
         from plyfile import PlyData
     except ImportError as error:
@@ -155,10 +158,11 @@ def _read_ply(path: Path) -> tuple[Float32, Bool]:
     return _beams(path, data, tuple(data.dtype.names or ()))
 
 
-def _beams(path: Path, data: Any, names: tuple[str, ...]) -> tuple[Float32, Bool]:
+def _beams(path: Path, data: Any, names: tuple[str, ...]) -> tuple[Floats, Bool]:
     if not {"x", "y", "z"} <= set(names):
         raise DatasetError(f"{path}: fields {' '.join(names)}, need x y z")
-    points = np.stack([np.asarray(data[axis], np.float32) for axis in "xyz"], axis=1)
+    dtype = np.result_type(np.float32, *(data[axis].dtype for axis in "xyz"))
+    points = np.stack([np.asarray(data[axis], dtype) for axis in "xyz"], axis=1)
     if "is_return" not in names:
         return points, np.ones(len(points), np.bool_)
     return points, np.asarray(data["is_return"]) != 0

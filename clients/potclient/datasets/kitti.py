@@ -10,12 +10,16 @@ from potclient.arrays import Float64
 from potclient.datasets.scans import RecordedScan, Recording, natural_key, read_poses, read_stamps
 from potclient.errors import DatasetError
 
+_FIELDS, _SWEEP_FIELDS = "x y z reflectance", "x y z intensity ring"
+
 
 class KittiRecording(Recording):
     """A KITTI sequence.
 
     KITTI gives poses of camera 0 (x right, y down, z forward); the sensor's pose is inv(Tr) P Tr with `Tr` of calib.txt, in a
     map frame that is the velodyne at the first pose. A pose file whose name contains "velo" is taken as it is.
+
+    Files called `*.pcd.bin` are nuScenes' sweeps: five numbers a point, the last of them the ring.
 
     Args:
         path: Folder with `velodyne/`; poses in `poses.txt`, or in the official place `../../poses/<sequence>.txt`.
@@ -49,11 +53,13 @@ class KittiRecording(Recording):
     def read(self, i: int) -> RecordedScan:
         file = self._files[i]
         data = file.read_bytes()
-        if len(data) % 16:
+        fields = _SWEEP_FIELDS if file.name.lower().endswith(".pcd.bin") else _FIELDS
+        n_fields = len(fields.split())
+        if len(data) % (4 * n_fields):
             raise DatasetError(
-                f"{file}: {len(data)} bytes are not whole points of 4 float32 (x y z reflectance)"
+                f"{file}: {len(data)} bytes are not whole points of {n_fields} float32 ({fields})"
             )
-        points = np.frombuffer(data, "<f4").reshape(-1, 4)[:, :3]
+        points = np.frombuffer(data, "<f4").reshape(-1, n_fields)[:, :3]
         return RecordedScan(
             points=np.ascontiguousarray(points, np.float32),
             is_return=np.ones(len(points), np.bool_),

@@ -14,6 +14,8 @@ import numpy as np
 from potclient.arrays import Bool, Float32, Float64
 from potclient.errors import DatasetError
 
+_MAX_STAMP_S = 2.0**63 / 1e9
+
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class RecordedScan:
@@ -180,6 +182,9 @@ def read_poses(path: Path, n_scans: int) -> Float64:
         raise DatasetError(
             f"poses: {path} line {line} is not a rotation and a translation (off by {defect[line - 1]:.2g})"
         )
+    if not np.isfinite(poses).all():
+        line = int(np.argmax(~np.isfinite(poses).all(axis=(1, 2)))) + 1
+        raise DatasetError(f"poses: {path} line {line} has a translation that is not finite")
     return poses
 
 
@@ -187,14 +192,28 @@ def read_stamps(path: Path | None, n_scans: int, *, period_s: float = 0.1) -> li
     """Stamps, ns, strictly growing: from a file of seconds, or made up at a steady rate if there is none.
 
     Raises:
-        DatasetError: the file has another number of lines.
+        DatasetError: the file has another number of lines, or one is not a time.
     """
     if path is None or not path.is_file():
         return growing([round(i * period_s * 1e9) for i in range(n_scans)])
     seconds = read_table(path, "times")[:, 0]
     if len(seconds) != n_scans:
         raise DatasetError(f"times: {path} has {len(seconds)} lines for {n_scans} scans")
-    return growing([round(float(s) * 1e9) for s in seconds])
+    try:
+        return growing([stamp_of(float(s)) for s in seconds])
+    except ValueError as error:
+        raise DatasetError(f"times: {path}: {error}") from error
+
+
+def stamp_of(seconds: float) -> int:
+    """The stamp, ns.
+
+    Raises:
+        ValueError: it is not finite, or more than 64 bits of nanoseconds hold.
+    """
+    if not abs(seconds) < _MAX_STAMP_S:  # also where it is not a number
+        raise ValueError(f"{seconds} is not a time in seconds")
+    return round(seconds * 1e9)
 
 
 def growing(stamps_ns: list[int]) -> list[int]:
