@@ -20,7 +20,7 @@ from types import TracebackType
 import zenoh
 
 from potschemas import __version__, keys
-from potserver.adapters.presence import refuse_second_server
+from potserver.adapters.presence import OtherServers
 from potserver.adapters.query_pool import QueryPool
 from potserver.adapters.questions.registry import warm_up
 from potserver.adapters.session import build_config, close_session, open_session
@@ -107,9 +107,10 @@ class MapServer:
             atexit.register(self.stop)  # leaving with Zenoh open would abort the process
             try:
                 served = [keys.MapKeys(s.root, map_id) for map_id in s.maps]
-                refuse_second_server(self._session, served)
-                _warm_up(mappers[0])  # all maps share the compiled numerics
-                refuse_second_server(self._session, served)  # one that was warming up beside us
+                with OtherServers(self._session, served) as others:
+                    others.refuse()
+                    _warm_up(mappers[0])  # all maps share the compiled numerics
+                    others.refuse()  # one that was warming up beside us
                 self._serve(self._session, mappers, stamps)
             except BaseException:
                 self._teardown(0.0)

@@ -24,34 +24,70 @@ _POLL_S = 0.25
 _ASK_S = 2.0  # for the tokens that routers know
 
 
-def refuse_second_server(session: zenoh.Session, maps: Iterable[keys.MapKeys]) -> None:
-    """Wait until nobody else serves our maps: two writers of one map would each give every cloud a receipt.
+class OtherServers:
+    """Who else serves our maps. A context: it listens from its entry on.
 
-    A token may be that of a server that has just crashed, so it gets `GONE_S` to vanish.
-
-    Raises:
-        SettingsError: another server still serves one of them.
+    It asks and listens too: only an answered question says that all tokens of now were heard of, but a question to a
+    peer that is reached both directly and over a router sometimes comes back empty (Zenoh 1.10).
     """
-    until = time.monotonic() + GONE_S
-    for map_keys in maps:
-        waited = False
-        while others := _servers(session, map_keys):
-            names = ", ".join(others)
-            if time.monotonic() >= until:
-                raise SettingsError(
-                    f"map {map_keys.map_id!r} under the root {map_keys.root!r} is served already, by {names}: serve"
-                    " another map (--map ID), take another root (--root KEY), or stop that server"
+
+    def __init__(self, session: zenoh.Session, maps: Iterable[keys.MapKeys]) -> None:
+        self._session, self._maps = session, tuple(maps)
+        self._lock = threading.Lock()
+        self._heard: set[str] = set()  # keys of tokens
+        self._subscribers: list[zenoh.Subscriber[None]] = []
+
+    def __enter__(self) -> OtherServers:
+        for map_keys in self._maps:
+            self._subscribers.append(
+                self._session.liveliness().declare_subscriber(
+                    map_keys.server_token("*"), self._note, history=True
                 )
-            if not waited:
-                waited = True
-                log.warning("map_served_already", map_id=map_keys.map_id, server_id=names, wait_s=GONE_S)
-            time.sleep(_POLL_S)
+            )
+        return self
 
+    def __exit__(self, *_: object) -> None:
+        for subscriber in self._subscribers:
+            subscriber.undeclare()
 
-def _servers(session: zenoh.Session, map_keys: keys.MapKeys) -> list[str]:
-    """Ids of the servers of a map that others have announced."""
-    replies = session.liveliness().get(map_keys.server_token("*"), timeout=_ASK_S)
-    return sorted({str(reply.ok.key_expr).rsplit("/", 2)[1] for reply in replies if reply.ok is not None})
+    def refuse(self) -> None:
+        """Wait until nobody else serves our maps: two writers of one map would each give every cloud a receipt.
+
+        A token may be that of a server that has just crashed, so it gets `GONE_S` to vanish.
+
+        Raises:
+            SettingsError: another server still serves one of them.
+        """
+        until = time.monotonic() + GONE_S
+        for map_keys in self._maps:
+            waited = False
+            while others := self._servers(map_keys):
+                names = ", ".join(others)
+                if time.monotonic() >= until:
+                    raise SettingsError(
+                        f"map {map_keys.map_id!r} under the root {map_keys.root!r} is served already, by {names}: serve"
+                        " another map (--map ID), take another root (--root KEY), or stop that server"
+                    )
+                if not waited:
+                    waited = True
+                    log.warning("map_served_already", map_id=map_keys.map_id, server_id=names, wait_s=GONE_S)
+                time.sleep(_POLL_S)
+
+    def _servers(self, map_keys: keys.MapKeys) -> list[str]:
+        """Ids of the servers of a map that others have announced."""
+        replies = self._session.liveliness().get(map_keys.server_token("*"), timeout=_ASK_S)
+        tokens = {str(reply.ok.key_expr) for reply in replies if reply.ok is not None}
+        with self._lock:
+            tokens |= self._heard
+        ids = {key.rsplit("/", 2)[1] for key in tokens}
+        return sorted(server_id for server_id in ids if map_keys.server_token(server_id) in tokens)
+
+    def _note(self, sample: zenoh.Sample) -> None:
+        with self._lock:
+            if sample.kind == zenoh.SampleKind.DELETE:
+                self._heard.discard(str(sample.key_expr))
+            else:
+                self._heard.add(str(sample.key_expr))
 
 
 class ServerToken:
