@@ -31,7 +31,7 @@ from potclient.errors import (
 from potclient.session import SessionOptions, open_session
 from potclient.zenoh_config import DEFAULT_ENDPOINT
 from potschemas import messages
-from potschemas.keys import MapKeys
+from potschemas.keys import MapKeys, server_of
 from potschemas.messages import Message
 from potschemas.wire import WireError, decode, encode, encoding_of
 
@@ -196,12 +196,12 @@ class Link:
             self.check_open()
 
     def _note_server(self, sample: zenoh.Sample) -> None:
-        _, server, map_id = str(sample.key_expr).rsplit("/", 2)
+        served = server_of(str(sample.key_expr))
         with self._servers_changed:
             if sample.kind == zenoh.SampleKind.PUT:
-                self._alive.add((server, map_id))
+                self._alive.add(served)
             else:
-                self._alive.discard((server, map_id))
+                self._alive.discard(served)
             self._servers_changed.notify_all()
 
     def _other_maps_hint(self) -> str:

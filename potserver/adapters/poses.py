@@ -11,6 +11,7 @@ import numpy as np
 import zenoh
 from numpy.typing import NDArray
 
+from potclient.poses import quaternion_rotation
 from potschemas import keys, messages
 from potserver.adapters.key_exprs import check_robot_id, sender_of
 from potserver.adapters.stamps import check_not_future
@@ -187,7 +188,7 @@ def interpolate(start: Float64, end: Float64, fraction: float) -> Float64:
     else:
         q = (np.sin((1 - fraction) * angle) * q0 + np.sin(fraction * angle) * q1) / np.sin(angle)
     pose = np.eye(4)
-    pose[:3, :3] = _rotation(q / np.linalg.norm(q))
+    pose[:3, :3] = quaternion_rotation(*(q / np.linalg.norm(q)))
     pose[:3, 3] = (1 - fraction) * start[:3, 3] + fraction * end[:3, 3]
     return pose
 
@@ -211,14 +212,3 @@ def _quaternion(R: NDArray[np.float64]) -> Float64:
     )
     q = np.array(rows[i])
     return np.asarray(q / np.linalg.norm(q))
-
-
-def _rotation(q: Float64) -> Float64:
-    w, x, y, z = q
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
-    )

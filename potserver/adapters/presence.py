@@ -79,8 +79,8 @@ class OtherServers:
         tokens = {str(reply.ok.key_expr) for reply in replies if reply.ok is not None}
         with self._lock:
             tokens |= self._heard
-        ids = {key.rsplit("/", 2)[1] for key in tokens}
-        return sorted(server_id for server_id in ids if map_keys.server_token(server_id) in tokens)
+        served = map(keys.server_of, tokens)
+        return sorted(server_id for server_id, map_id in served if map_id == map_keys.map_id)
 
     def _note(self, sample: zenoh.Sample) -> None:
         with self._lock:

@@ -111,3 +111,15 @@ def robot_of(key: str) -> str:
     if len(chunks) < 4 or chunks[-3] not in ("in", "out", "robot"):
         raise ValueError(f"key {key!r} is not of a robot")
     return chunks[-2]
+
+
+def server_of(token: str) -> tuple[str, str]:
+    """The server and the map of a token that `MapKeys.server_token` made.
+
+    Raises:
+        ValueError: the key is not of that form.
+    """
+    chunks = token.split("/")
+    if len(chunks) < 4 or chunks[-3] != "srv":
+        raise ValueError(f"key {token!r} is not a server's token")
+    return chunks[-2], chunks[-1]

@@ -12,6 +12,7 @@ from potschemas.keys import (
     check_map_id,
     check_root,
     robot_of,
+    server_of,
     stats_key,
 )
 
@@ -87,3 +88,14 @@ def test_the_robot_is_read_back_from_its_keys(root: str, robot: str) -> None:
 def test_a_key_without_a_robot_is_refused(key: str) -> None:
     with pytest.raises(ValueError, match="robot"):
         robot_of(key)
+
+
+@pytest.mark.parametrize("root", ["pot/v1", "a", "a/b/c"])
+def test_the_server_and_the_map_of_a_token(root: str) -> None:
+    assert server_of(MapKeys(root, "roof").server_token("s1")) == ("s1", "roof")
+
+
+@pytest.mark.parametrize("key", ["", "@pot/v1/srv/s1", "@pot/v1/robot/r1/roof", "pot/v1/srv/s1/stats/x"])
+def test_keys_that_are_no_token_of_a_server(key: str) -> None:
+    with pytest.raises(ValueError, match="not a server's token"):
+        server_of(key)

@@ -21,6 +21,7 @@ from potclient.commands.shared import (
     say_rows,
     write_json,
 )
+from potclient.poses import yaw_pose
 
 _ARRAYS = ("max_probability", "union_probability", "unknown_share")
 _TOTALS = (
@@ -116,9 +117,9 @@ def _path_poses(path: Path) -> Float64:
     poses = np.tile(np.eye(4), (len(rows), 1, 1))
     if rows.shape[1] == 12:
         poses[:, :3] = rows.reshape(-1, 3, 4)
-        return poses
-    poses[:, :3, 3] = rows[:, :3]
-    if rows.shape[1] == 4:
-        cos, sin = np.cos(rows[:, 3]), np.sin(rows[:, 3])
-        poses[:, 0, 0], poses[:, 0, 1], poses[:, 1, 0], poses[:, 1, 1] = cos, -sin, sin, cos
+    elif rows.shape[1] == 4:
+        for pose, (x, y, z, yaw) in zip(poses, rows, strict=True):
+            pose[:] = yaw_pose(x, y, yaw, z)
+    else:
+        poses[:, :3, 3] = rows
     return poses

@@ -11,6 +11,7 @@ import numpy as np
 from potclient.arrays import Bool, Float64, Floats
 from potclient.datasets.scans import RecordedScan, Recording, natural_key, read_poses, read_stamps
 from potclient.errors import DatasetError
+from potclient.poses import quaternion_rotation
 
 RECORDING_FILE = "recording.json"
 FRAMES = ("auto", "sensor", "world")
@@ -189,15 +190,10 @@ def read_viewpoint(path: Path) -> Float64:
             norm = float(np.sqrt(w * w + x * x + y * y + z * z))
             if not norm > 0:
                 raise DatasetError(f"{path}: VIEWPOINT has a quaternion of length {norm}")
-            w, x, y, z = w / norm, x / norm, y / norm, z / norm
-            return np.array(
-                [
-                    [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w), tx],
-                    [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w), ty],
-                    [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y), tz],
-                    [0.0, 0.0, 0.0, 1.0],
-                ]
-            )
+            pose = np.eye(4)
+            pose[:3, :3] = quaternion_rotation(w / norm, x / norm, y / norm, z / norm)
+            pose[:3, 3] = tx, ty, tz
+            return pose
     return np.eye(4)
 
 
