@@ -147,10 +147,10 @@ def _options() -> argparse.Namespace:
 
 def _maps(options: argparse.Namespace) -> list[Mapper]:
     atoms, settings = AtomDictionary.builtin(), MappingSettings()
-    never = dataclasses.replace(settings, fade_rate=0.0)
+    never = dataclasses.replace(settings, gone_odds=0.0)
     maps: list[Mapper] = [
         ServiceMap("ours", MappingService(atoms, settings, threads=options.threads)),
-        ServiceMap("ours, fade_rate 0", MappingService(atoms, never, threads=options.threads)),
+        ServiceMap("ours, gone_odds 0", MappingService(atoms, never, threads=options.threads)),
         peer_named("octomap:0.2", threads=options.threads),
     ]
     for a_map in maps:

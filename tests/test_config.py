@@ -134,7 +134,7 @@ def test_a_profile_sets_what_the_other_keys_start_from(write: Any) -> None:
         ({"threads": 0}, "at least 1"),
         ({"zenoh.mode": "broker"}, "peer, client or router"),
         ({"log.level": "loud"}, "debug, info"),
-        ({"mapping.profile": "none"}, "'none', need one of default, sharp, paper"),
+        ({"mapping.profile": "none"}, "'none', need one of default, paper"),
         ({"mapping.max_range_m": -1.0}, r"mapping\.max_range_m is -1\.0, need a positive number"),
         ({"mapping.beams_per_scan": 1.5}, r"mapping\.beams_per_scan = 1\.5"),
         ({"store.snapshot_scans": 1}, "no setting any more"),

@@ -103,8 +103,10 @@ class KernelSet:
         origin = self.hinge_mean.mean(axis=0)
         hinges = self.hinge_mean - origin
         gamma = self.gamma_shape.astype(np.float64) / self.gamma_rate.astype(np.float64)
-        weights = np.stack([self.weight_mean.astype(np.float64), np.ones(k)], axis=1)
         weight_var = self.weight_var.astype(np.float64)
+        weights = np.stack(
+            [self.weight_mean.astype(np.float64), answers.known(weight_var, self.rule)], axis=1
+        )
         for rows, x, near in _neighbourhoods(points - origin, hinges, gamma):
             step = max(1, _BLOCK_ELEMENTS // len(rows))
             for first in range(0, len(near), step):
@@ -116,7 +118,7 @@ class KernelSet:
                 sums.activation[rows] += activation
                 if slopes is not None:
                     slopes.mean[rows] += _slopes(phi, x, h, -2.0 * g * w[:, 0])
-                    slopes.activation[rows] += _slopes(phi, x, h, -2.0 * g)
+                    slopes.activation[rows] += _slopes(phi, x, h, -2.0 * g * w[:, 1])
                 np.square(phi, out=phi)
                 sums.var[rows] += phi @ v
                 if slopes is not None:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from potschemas import answers
-from potschemas.answers import OBSERVED_ACTIVATION, AnswerRule, LatentSums
+from potschemas.answers import AnswerRule, LatentSums
 from potserver.domain.types import Float32, Float64, KernelSet, Occupancy, Unknown
 from potserver.errors import BadPointsError, ShapeError
 from potserver.numerics import gradients, kernel_index, rays
@@ -26,14 +26,15 @@ class IndexedKernels(NamedTuple):
     lookup: kernel_index.KernelIndex
 
     @staticmethod
-    def of(kernels: KernelSet, observed_activation: float = OBSERVED_ACTIVATION) -> IndexedKernels:
-        """Index kernels for maps with this `observed_activation`."""
+    def of(kernels: KernelSet, rule: AnswerRule = AnswerRule()) -> IndexedKernels:
+        """Index kernels for maps with this `observed_activation` and `prior_var`."""
         lookup = kernel_index.build_index(
             kernels.hinge_mean,
             kernels.gamma,
             kernels.weight_mean,
             kernels.weight_var,
-            activation_cut=observed_activation / 20.0,
+            activation_cut=rule.observed_activation / 20.0,
+            prior_var=rule.prior_var,
         )
         return IndexedKernels(kernels, lookup)
 
@@ -53,7 +54,7 @@ class KernelMap:
 
         Args:
             kernels: In the map frame; gamma enters by its mean. Or parts that were indexed before, at the rule's
-                `observed_activation`, so that only new parts cost time.
+                `observed_activation` and `prior_var`, so that only new parts cost time.
             rule: What turns sums over the kernels into answers.
             map_revision: Carried into the answers.
             threads: Threads a query may use; all processors by default.
@@ -62,7 +63,7 @@ class KernelMap:
         self.map_revision = map_revision
         self._threads = threads or default_threads()
         if isinstance(kernels, KernelSet):
-            kernels = [IndexedKernels.of(kernels, rule.observed_activation)]
+            kernels = [IndexedKernels.of(kernels, rule)]
         self._parts = tuple(kernels)
         self._index = kernel_index.IndexParts.of([part.lookup for part in self._parts])
 
@@ -173,7 +174,7 @@ class KernelMap:
         """One index of all kernels, for questions that walk through the parts; built by the first of them."""
         if len(self._parts) == 1:
             return self._parts[0].lookup
-        return IndexedKernels.of(self.kernels, self.rule.observed_activation).lookup
+        return IndexedKernels.of(self.kernels, self.rule).lookup
 
     @cached_property
     def typical_width_m(self) -> float:
@@ -188,7 +189,7 @@ class KernelMap:
     def widths(self, points: Float64) -> Float64:
         """(N,) m: mean of sqrt(pi / (2 gamma)) of the kernels at (N, 3) points, by activation; `typical_width_m` if none."""
         columns = self._whole.columns.copy()
-        columns[1], columns[2] = rays.kernel_widths(self._whole), 0.0
+        columns[1], columns[2] = rays.kernel_widths(self._whole) * columns[4], 0.0
         weighted = kernel_index.latent_sums(
             self._whole._replace(columns=columns), points, threads=self._threads, lane="query"
         )

@@ -30,7 +30,7 @@ from potserver.errors import SolverError
 from potserver.mapping.placing import activation, gamma_of_spacing, kernels_at
 from potserver.mapping.refinement import FEATURE_CUT
 from potserver.mapping.settings import MappingSettings
-from potserver.mapping.surfaces import Samples, SharpFaces, surface_samples
+from potserver.mapping.surfaces import FACE_SAMPLES, FaceSamples, Samples, surface_samples
 from potserver.numerics import evidence
 from potserver.numerics.arrays import UInt8
 from potserver.numerics.beams import Beams, LabelledPoints, beam_weights
@@ -40,8 +40,8 @@ from potserver.numerics.lattice_nodes import new_nodes
 from potserver.numerics.warm_fit import Prior, Solver, warm_fit
 
 _FINEST_M, _COARSEST_M, _FINE_PER_RANGE = 0.2, 0.4, 1.0 / 20.0
-_COARSE_REACH = 1.0  # spacings: nearer coarse nodes than this get a kernel, see lattice_nodes.new_nodes
-_FINE_REACH = 0.0  # the same for fine nodes about hits: the nearest alone
+_COARSE_REACH = 0.7  # spacings: nearer coarse nodes than this get a kernel, see lattice_nodes.new_nodes
+_FINE_REACH = 0.9  # the same for fine nodes about hits, so that faces have nodes on both sides
 _TOO_WIDE = 1.5  # coarse spacings
 _REACHED = 0.1  # activation by a carried kernel below which a point or a row is not its own
 _EXPLAINED = 1.0  # activation by carried kernels at which the lattice adds none
@@ -58,7 +58,7 @@ _CHEAP_VALUES = 60_000_000  # features that a solve may touch for more Newton st
 class FitEffort(NamedTuple):
     """Steps of one solve, from where the map is."""
 
-    newton_steps: int = 2  # at least
+    newton_steps: int = 3  # at least
     most_newton_steps: int = 6  # where the map is small and steps are cheap
     gradient_steps: int = 4  # conjugate-gradient steps for each Newton step
 
@@ -70,23 +70,21 @@ SCAN_EFFORT = FitEffort()
 class FusionOptions:
     """How scans enter the overall map; the settings of the same names say more."""
 
-    free_gap_m: float
-    fade_rate: float
+    gone_odds: float
     max_kernels_per_tile: int
     effort: FitEffort = SCAN_EFFORT
-    sharp: SharpFaces | None = None  # none: labels along beams alone
+    faces: FaceSamples = FACE_SAMPLES
 
     @staticmethod
     def of(
-        settings: MappingSettings, effort: FitEffort = SCAN_EFFORT, sharp: SharpFaces | None = None
+        settings: MappingSettings, effort: FitEffort = SCAN_EFFORT, faces: FaceSamples = FACE_SAMPLES
     ) -> FusionOptions:
         """What fusion needs of the settings."""
         return FusionOptions(
-            free_gap_m=settings.free_gap_m,
-            fade_rate=settings.fade_rate,
+            gone_odds=settings.gone_odds,
             max_kernels_per_tile=settings.max_kernels_per_tile,
             effort=effort,
-            sharp=sharp,
+            faces=faces,
         )
 
 
@@ -190,20 +188,18 @@ def _samples_of(look: Look, region: Region, options: FusionOptions, threads: int
     parts = [
         Samples(labelled.points - region.origin_m, labelled.occupied.astype(np.uint8), beam_weights(labelled))
     ]
-    if options.fade_rate:
+    if options.gone_odds:
         seen = evidence.see_through(
-            region.rows, look.beams, start, fine_m=grid.fine_m, rate=options.fade_rate, gap_m=options.free_gap_m,
-            threads=threads,
-        )  # fmt: skip
-        parts.append(Samples(seen.points, np.full(len(seen.points), evidence.FREE, np.uint8), seen.weight))
-    if options.sharp is not None:
-        known = region.rows.take(region.rows.occupied & evidence.is_alive(region.rows))
-        where = evidence.positions(known, grid.fine_m)
-        parts.append(
-            surface_samples(
-                look.beams, start, where, 0.5 * grid.fine_m, options.sharp, look.rng, planar=look.is_planar
-            )
+            region.rows, look.beams, start, fine_m=grid.fine_m, odds=options.gone_odds, threads=threads
         )
+        parts.append(Samples(*seen))
+    known = region.rows.take(region.rows.occupied & evidence.is_alive(region.rows))
+    where = evidence.positions(known, grid.fine_m)
+    parts.append(
+        surface_samples(
+            look.beams, start, where, 0.5 * grid.fine_m, options.faces, look.rng, planar=look.is_planar
+        )
+    )
     return Samples.concatenate(parts)
 
 
@@ -274,17 +270,14 @@ def add_evidence(
     Within a box, old rows that say little join others: see `evidence.add_sparing`.
     """
     fine_m = region.grid.fine_m
-    beside = (samples.kind == evidence.NEAR) | (samples.kind == evidence.SHADOW)
-    points, kind, weight = (column[~beside] for column in samples)
-    rows, gained, n_old = evidence.add_sparing(
-        region.rows, points, kind, weight, fine_m, source, within=within, turn=turn
-    )
+    beside = samples.kind > evidence.HIT
+    along = samples.take(~beside)
+    rows, gained, n_old = evidence.add_sparing(region.rows, *along, fine_m, source, within=within, turn=turn)
     new = slice(n_old, len(rows.kind))
-    points, kind, weight = (column[beside] for column in samples)
-    rows, more = evidence.add(rows, points, kind, weight, fine_m, source)
+    rows, more = evidence.add(rows, *samples.take(beside), fine_m, source)
     more[: len(gained)] += gained
-    evidence.clip_shadows(rows)
-    evidence.forget(rows.sums, more, evidence.cells(rows), _MEMORY)
+    evidence.clip(rows, _MEMORY)
+    evidence.forget(rows, more, evidence.cells(rows), _MEMORY)
     region.rows = rows
     return rows.take(new)
 
@@ -298,13 +291,11 @@ def add_kernels(
     threads: int,
 ) -> MapKernels:
     """Put kernels where new rows ask for them, beside those that are taken as they are; all that were added."""
-    grid, present, sharp = region.grid, region.kernels, options.sharp
-    coarse_reach = _COARSE_REACH if sharp is None else sharp.coarse_reach
-    fine_reach = _FINE_REACH if sharp is None else sharp.fine_reach
+    grid, present = region.grid, region.kernels
     asking = evidence.positions(new_rows, grid.fine_m)
     parts = [taken]
     from_atoms = KernelSet.concatenate([present.kernels.take(present.level == CARRIED), taken.kernels])
-    for level, spacing, within in ((COARSE, grid.coarse_m, coarse_reach), (FINE, grid.fine_m, fine_reach)):
+    for level, spacing, within in ((COARSE, grid.coarse_m, _COARSE_REACH), (FINE, grid.fine_m, _FINE_REACH)):
         there = present.kernels.hinge_mean[present.level == level]
         nodes = new_nodes(
             asking if level == COARSE else asking[new_rows.occupied],
@@ -413,7 +404,9 @@ def _fit(region: Region, lower: Float64, upper: Float64, options: FusionOptions,
     pad = grid.coarse_m
     where = evidence.positions(region.rows, grid.fine_m)
     rows = np.flatnonzero(
-        inside_box(where, lower - 2 * pad, upper + 2 * pad) & evidence.is_alive(region.rows)
+        inside_box(where, lower - 2 * pad, upper + 2 * pad)
+        & evidence.is_alive(region.rows)
+        & evidence.is_label(region.rows)
     )
     local = np.flatnonzero(inside_box(kernels.hinge_mean, lower - 4 * pad, upper + 4 * pad))
     hinge = kernels.hinge_mean[local]
@@ -441,10 +434,9 @@ def _fit(region: Region, lower: Float64, upper: Float64, options: FusionOptions,
         raise SolverError(f"the weights of {len(local)} kernels on {len(rows)} rows came out NaN or infinite")
     mean, var = kernels.weight_mean.copy(), kernels.weight_var.copy()
     solved = local[free]
-    mean[solved], var[solved] = fit.weights[free], fit.var[free]
-    if options.sharp is not None:
-        support = _support_of(blocks, region.rows.kind[rows], counts, threads)
-        var[solved] = support.variance(region.kernels.prior_var[local])[free]
+    support = _support_of(blocks, region.rows.kind[rows], counts, threads)
+    mean[solved] = fit.weights[free]
+    var[solved] = support.variance(region.kernels.prior_var[local])[free]
     keep = np.ones(len(kernels), bool)
     keep[local[free & (fit.support < _UNSUPPORTED)]] = False
     region.kernels = MapKernels(

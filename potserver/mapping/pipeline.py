@@ -24,12 +24,13 @@ from potserver.mapping.sampling import BeamLimits, DrawnBeams, Draws, draw_beams
 from potserver.mapping.sectors import SectorCut, cut_sectors
 from potserver.mapping.settings import MappingSettings
 from potserver.mapping.stopwatch import Stopwatch
-from potserver.mapping.surfaces import SharpFaces
+from potserver.mapping.surfaces import FACE_SAMPLES, FaceSamples
 from potserver.mapping.transport import CouplingOptions
 from potserver.numerics.beams import LabelledPoints, label_beams
 
-# `mean_moderation` of a twentieth: variances are of single weights, and all of them would make the map timid
-DEFAULT_RULE = AnswerRule(residual_var=50.0, mean_moderation=0.05)
+# A full lattice of known kernels sums to an activation of 3.4 (in 2D 2.3), half of it to about half: what has less lies beyond
+# the data. `mean_moderation` of a twentieth: variances are of single weights, and all of them would make the map timid.
+DEFAULT_RULE = AnswerRule(observed_activation=1.4, residual_var=50.0, mean_moderation=0.05)
 
 
 class Method(NamedTuple):
@@ -41,7 +42,7 @@ class Method(NamedTuple):
     ranking: Ranking = Ranking()
     coupling: CouplingOptions = CouplingOptions()
     effort: FitEffort = SCAN_EFFORT
-    sharp: SharpFaces | None = None
+    faces: FaceSamples = FACE_SAMPLES
     rule: AnswerRule = DEFAULT_RULE  # how the map answers until its self-check has points enough
     is_calibrated: bool = True  # then the self-check chooses the rule's `mean_moderation`
 
@@ -89,7 +90,7 @@ class Pipeline(ABC):
         """
         self.settings, self.method = settings, method or Method()
         self.threads, self.seed = threads, seed
-        self.fusion = FusionOptions.of(settings, self.method.effort, self.method.sharp)
+        self.fusion = FusionOptions.of(settings, self.method.effort, self.method.faces)
 
     @abstractmethod
     def integrate(self, state: MapState, scan: Scan, carrier: Carrier) -> Integrated:

@@ -18,11 +18,10 @@ from potserver.domain.types import Float64, MapUpdate, Scan, TileChange, yaw_pos
 from potserver.errors import SettingsError, UnknownRobotError
 from potserver.mapping import edits
 from potserver.mapping.default import DefaultPipeline
-from potserver.mapping.fusion import FitEffort, Moment
+from potserver.mapping.fusion import Moment
 from potserver.mapping.paper import PAPER, PotPipeline
 from potserver.mapping.pipeline import Method, Pipeline
 from potserver.mapping.settings import MappingSettings
-from potserver.mapping.surfaces import SHARP_RULE, SharpFaces
 from potserver.numerics.threads import default_threads
 
 Commit = Callable[[MapState], None]  # told of a new state before it becomes the map
@@ -36,7 +35,6 @@ class MakePipeline(Protocol):
 
 _METHODS = {
     "default": Method(),
-    "sharp": Method(effort=FitEffort(newton_steps=3), sharp=SharpFaces(), rule=SHARP_RULE),
     "paper": PAPER,
 }
 

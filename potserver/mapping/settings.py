@@ -15,7 +15,7 @@ class MappingSettings:
 
     profile: Annotated[
         str,
-        "`default`; `sharp`: walls where they are; `paper`: as the authors' code",
+        "`default`, or `paper`: as the authors' code",
     ] = "default"
 
     # range limits
@@ -34,9 +34,9 @@ class MappingSettings:
     max_kernels_per_tile: Annotated[int, "further kernels of a full tile are left out"] = 8_000
 
     # forgetting
-    fade_rate: Annotated[
-        float, "share of its weight that a hit loses with each scan that sees through it"
-    ] = 0.05
+    gone_odds: Annotated[
+        float, "odds against beams missing what is still there, beyond which it has left; 0: nothing leaves"
+    ] = 300.0
     half_life_s: Annotated[
         float, "time in which evidence that nobody renews loses half its weight, by stamps; 0: it never does"
     ] = 0.0
@@ -80,10 +80,9 @@ class MappingSettings:
         return MappingSettings(profile=profile, **_OF_PROFILE[profile])
 
 
-_MAY_BE_ZERO = ("min_range_m", "free_gap_m", "resolution_m", "fade_rate", "half_life_s", "check_share")
+_MAY_BE_ZERO = ("min_range_m", "free_gap_m", "resolution_m", "gone_odds", "half_life_s", "check_share")
 _OF_PROFILE: dict[str, dict[str, Any]] = {
     "default": {},
-    "sharp": {},
     # what the authors' code does, as far as an operator would choose it; mapping/paper.py has the rest
     "paper": {"max_range_m": 20.0, "beams_per_scan": 8_000, "check_share": 0.0},
 }

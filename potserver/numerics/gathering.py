@@ -73,15 +73,16 @@ def kernels_around(index, points, found, local):
         index: A KernelIndex.
         points: (N, 3) float64, m.
         found: (F,) int64, a buffer.
-        local: (6, L) float32, a buffer.
+        local: (7, L) float32, a buffer.
     Returns:
         n, both buffers, replaced by larger ones if they were too small, and the middle's x, y and z. The first n columns of
-        `local` are the kernels: relative hinge x, y, z (m), -gamma (1/m^2), weight and variance.
+        `local` are the kernels: relative hinge x, y, z (m), -gamma (1/m^2), weight, variance and
+        what is known of the weight.
     """
     lower, upper = bounds(points)
     n, found = kernels_that_reach(index, lower, upper, found)
     if n > local.shape[1]:
-        local = np.empty((6, 2 * n), np.float32)
+        local = np.empty((7, 2 * n), np.float32)
     cx, cy, cz = 0.5 * (lower[0] + upper[0]), 0.5 * (lower[1] + upper[1]), 0.5 * (lower[2] + upper[2])
     hinge, columns = index.hinge, index.columns
     for i in range(n):
@@ -92,6 +93,7 @@ def kernels_around(index, points, found, local):
         local[3, i] = columns[0, m]
         local[4, i] = columns[1, m]
         local[5, i] = columns[2, m]
+        local[6, i] = columns[4, m]
     return n, found, local, cx, cy, cz
 
 

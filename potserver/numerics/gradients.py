@@ -15,7 +15,7 @@ from potserver.numerics.kernel_index import KernelIndex, sums_by_cube
 def latent_gradients(
     index: KernelIndex, points: Float64, *, threads: int = 1, lane: str = "map"
 ) -> LatentGradients:
-    """d/dx of sum w phi, sum v phi^2 and sum phi, with d phi/dx = -2 gamma (x - h) phi.
+    """d/dx of sum w phi, sum v phi^2 and sum k phi, with d phi/dx = -2 gamma (x - h) phi.
 
     Args:
         points: (N, 3) float64, m, same frame as the hinges.
@@ -28,7 +28,7 @@ def latent_gradients(
 
 
 @inner_loop
-def _gradient_point(x, y, z, hx, hy, hz, minus_gamma, w, v, n):
+def _gradient_point(x, y, z, hx, hy, hz, minus_gamma, w, v, known, n):
     mx = my = mz = np.float32(0)
     vx = vy = vz = np.float32(0)
     ax = ay = az = np.float32(0)
@@ -47,16 +47,17 @@ def _gradient_point(x, y, z, hx, hy, hz, minus_gamma, w, v, n):
         vx += b * dx
         vy += b * dy
         vz += b * dz
-        ax += slope * dx
-        ay += slope * dy
-        az += slope * dz
+        c = known[m] * slope
+        ax += c * dx
+        ay += c * dy
+        az += c * dz
     return mx, my, mz, vx, vy, vz, ax, ay, az
 
 
 @nb.njit(nogil=True, error_model="numpy", cache=True)
 def _gradient_cubes(points, cuts, index, sums):
     found = np.empty(4096, np.int64)
-    local = np.empty((6, 4096), np.float32)
+    local = np.empty((7, 4096), np.float32)
     for cube in range(len(cuts) - 1):
         a, b = cuts[cube], cuts[cube + 1]
         n, found, local, cx, cy, cz = kernels_around(index, points[a:b], found, local)
@@ -65,5 +66,5 @@ def _gradient_cubes(points, cuts, index, sums):
                 8, q
             ] = _gradient_point(
                 np.float32(points[q, 0] - cx), np.float32(points[q, 1] - cy), np.float32(points[q, 2] - cz),
-                local[0], local[1], local[2], local[3], local[4], local[5], n,
+                local[0], local[1], local[2], local[3], local[4], local[5], local[6], n,
             )  # fmt: skip

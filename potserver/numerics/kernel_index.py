@@ -1,7 +1,8 @@
 """Sums over many squared-exponential kernels, with each point looking only at the kernels that reach it.
 
-    latent mean  sum_m w_m phi_m(x),   latent variance  sum_m v_m phi_m(x)^2,   activation  sum_m phi_m(x)
+    latent mean  sum_m w_m phi_m(x),   latent variance  sum_m v_m phi_m(x)^2,   activation  sum_m known_m phi_m(x)
     phi_m(x) = exp(-gamma_m |x - h_m|^2)                                                        (paper eq. 1)
+    known_m = max(0, 1 - v_m / prior variance): a kernel that no data have touched activates nothing
 
 A kernel reaches as far as what it adds is above a cut tau; that depends on its gamma, weight and variance. tau is found by
 measuring: at sample points, all that is cut together may change the probability by less than a budget. Kernels are sorted into
@@ -13,6 +14,7 @@ points times kernels.
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -42,7 +44,7 @@ class KernelIndex(NamedTuple):
     """K kernels sorted by level and cell. Immutable; any number of threads may query it."""
 
     hinge: Float64  # (K, 3) m
-    columns: Float32  # (4, K): -gamma 1/m^2, w, v, reach m
+    columns: Float32  # (5, K): -gamma 1/m^2, w, v, reach m, known
     order: Int64  # (K,) number of each kernel in the arrays that the index was built from
     level_start: Int64  # (L + 1,) first kernel of each level
     level_edge: Float64  # (L,) m, cell edge; no kernel of the level reaches farther
@@ -120,6 +122,7 @@ def build_index(
     variance: Floats,
     *,
     activation_cut: float,
+    prior_var: float = math.inf,
     tau: float | None = None,
     guard_stacks: bool = True,
 ) -> KernelIndex:
@@ -131,6 +134,7 @@ def build_index(
         weight: (K,) log-odds.
         variance: (K,) log-odds^2, >= 0.
         activation_cut: phi below this is left out of the activation sum too.
+        prior_var: log-odds^2, variance of a weight of which nothing is known; all counts as known by default.
         tau: The cut, if it is known already; measured otherwise.
         guard_stacks: Let kernels reach farther where many lie on one spot, see `stack_sizes`.
     """
@@ -164,7 +168,8 @@ def build_index(
         starts.append(starts[-1] + len(members))
     lower, upper = bounds(hinge) if len(hinge) else (np.full(3, np.inf), np.full(3, -np.inf))
     permutation = np.concatenate(order) if order else np.zeros(0, np.int64)
-    columns = np.stack([-gamma, weight, variance, r])[:, permutation].astype(np.float32)
+    known = np.maximum(1.0 - variance / prior_var, 0.0)
+    columns = np.stack([-gamma, weight, variance, r, known])[:, permutation].astype(np.float32)
     return KernelIndex(
         hinge=hinge[permutation],
         columns=np.ascontiguousarray(columns),
@@ -323,7 +328,7 @@ def _cut_sums(points, hinge, gamma, weight, variance, taus):
 
 
 @inner_loop
-def _sum_point(x, y, z, hx, hy, hz, minus_gamma, w, v, n):
+def _sum_point(x, y, z, hx, hy, hz, minus_gamma, w, v, known, n):
     mean = np.float32(0)
     var = np.float32(0)
     activation = np.float32(0)
@@ -334,19 +339,19 @@ def _sum_point(x, y, z, hx, hy, hz, minus_gamma, w, v, n):
         phi = exp32(minus_gamma[m] * (dx * dx + dy * dy + dz * dz))
         mean += w[m] * phi
         var += v[m] * phi * phi
-        activation += phi
+        activation += known[m] * phi
     return mean, var, activation
 
 
 @nb.njit(nogil=True, error_model="numpy", cache=True)
 def _sum_cubes(points, cuts, index, sums):
     found = np.empty(4096, np.int64)
-    local = np.empty((6, 4096), np.float32)
+    local = np.empty((7, 4096), np.float32)
     for cube in range(len(cuts) - 1):
         a, b = cuts[cube], cuts[cube + 1]
         n, found, local, cx, cy, cz = kernels_around(index, points[a:b], found, local)
         for q in range(a, b):
             sums[0, q], sums[1, q], sums[2, q] = _sum_point(
                 np.float32(points[q, 0] - cx), np.float32(points[q, 1] - cy), np.float32(points[q, 2] - cz),
-                local[0], local[1], local[2], local[3], local[4], local[5], n,
+                local[0], local[1], local[2], local[3], local[4], local[5], local[6], n,
             )  # fmt: skip

@@ -147,7 +147,7 @@ def _softplus(z: float) -> float:
 
 
 @inner_loop
-def _sum_at(t, along, across2, minus_gamma, w, v, width, n):
+def _sum_at(t, along, across2, minus_gamma, w, v, width, known, n):
     mean = np.float32(0)
     var = np.float32(0)
     activation = np.float32(0)
@@ -157,8 +157,8 @@ def _sum_at(t, along, across2, minus_gamma, w, v, width, n):
         phi = exp32(minus_gamma[m] * (across2[m] + d * d))
         mean += w[m] * phi
         var += v[m] * phi * phi
-        activation += phi
-        weighted += width[m] * phi
+        activation += known[m] * phi
+        weighted += width[m] * known[m] * phi
     return mean, var, activation, weighted
 
 
@@ -167,7 +167,7 @@ def _march(first, last, rays, n_steps, block, march, index, widths, out, quantil
     origins, directions, max_range_m = rays
     hinge, columns, thresholds = index.hinge, index.columns, march.thresholds
     found = np.empty(4096, np.int64)
-    local = np.empty((6, 4096), np.float32)
+    local = np.empty((7, 4096), np.float32)
     lower, upper, middle = np.empty(3), np.empty(3), np.empty(3)
     for i in range(first, last):
         h = max_range_m[i] / n_steps[i]
@@ -190,7 +190,7 @@ def _march(first, last, rays, n_steps, block, march, index, widths, out, quantil
                     upper[c] = middle[c] + half * abs(directions[i, c])
                 n_found, found = kernels_that_reach(index, lower, upper, found)
                 if n_found > local.shape[1]:
-                    local = np.empty((6, 2 * n_found), np.float32)
+                    local = np.empty((7, 2 * n_found), np.float32)
                 n = 0
                 for j in range(n_found):
                     m = found[j]
@@ -209,11 +209,12 @@ def _march(first, last, rays, n_steps, block, march, index, widths, out, quantil
                         local[3, n] = columns[1, m]
                         local[4, n] = columns[2, m]
                         local[5, n] = widths[m]
+                        local[6, n] = columns[4, m]
                         n += 1
             r = step * h
             step += 1
             mean, var, activation, weighted = _sum_at(
-                np.float32(r + 0.5 * h - centre), local[0], local[1], local[2], local[3], local[4], local[5], n
+                np.float32(r + 0.5 * h - centre), local[0], local[1], local[2], local[3], local[4], local[5], local[6], n,
             )  # fmt: skip
             if n > 0 and activation >= march.observed_activation:
                 is_known = True

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from potserver.domain.tiles import CARRIED, MapKernels, Tile, TileGrid, TileIndex, voxels_along
 from potserver.domain.types import KERNEL_ARRAYS, KernelSet
 from potserver.errors import MapFileError, ShapeError
-from potserver.numerics.evidence import LABELS, Rows
+from potserver.numerics.evidence import KINDS, Rows
 from potserver.storage.seal import sealed, unsealed
 
 _HEAD = struct.Struct("<3i2q2I")  # index, revision, stamp_ns, rows, kernels
@@ -113,7 +113,7 @@ def _check(tile: Tile, grid: TileGrid, n_robots: int, index: TileIndex) -> None:
     edge = voxels_along(rows, grid)
     sound = (
         ((rows.voxel >= 0) & (rows.voxel < edge)).all()
-        and (rows.kind < len(LABELS)).all()
+        and np.isin(rows.kind, KINDS).all()
         and np.isfinite(rows.sums).all()
         and ((rows.source >= 0) & (rows.source < n_robots)).all()
         and ((kernels.level >= 0) & (kernels.level <= CARRIED)).all()

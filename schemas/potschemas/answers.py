@@ -2,7 +2,10 @@
 
 At a point x, with phi_m = exp(-gamma_m |x - h_m|^2), the kernels give three sums (`LatentSums`):
 
-    f = sum_m w_m phi_m        v = sum_m var_m phi_m^2        a = sum_m phi_m
+    f = sum_m w_m phi_m        v = sum_m var_m phi_m^2        a = sum_m known_m phi_m
+
+known_m = max(0, 1 - var_m / prior_var) is what is known of a weight: all of it when its variance is small, nothing while it is
+the prior's. So a kernel that data have not touched makes no point observed, wherever it reaches.
 
 An `AnswerRule` makes the answer from them. With c = mean_moderation:
 
@@ -39,7 +42,7 @@ Float = NDArray[np.floating]
 Float64 = NDArray[np.float64]
 _Real = TypeVar("_Real", bound=np.floating)
 
-# A point whose kernels sum to less activation than this is unobserved: nothing near it was ever seen.
+# A point whose known kernels sum to less activation than this is unobserved: nothing near it was ever seen.
 OBSERVED_ACTIVATION = 0.05
 # Variance of the latent where nothing is known, log-odds^2: a standard deviation of 10, anything from sure to sure.
 PRIOR_VAR = 100.0
@@ -52,11 +55,13 @@ class AnswerRule:
     The defaults of `residual_var` and `mean_moderation` are the paper's model.
 
     Raises:
-        ValueError: a number is negative or not finite.
+        ValueError: a number is negative or not finite, or the prior variance 0.
     """
 
     observed_activation: float = OBSERVED_ACTIVATION  # a point with less summed activation is unobserved
-    prior_var: float = PRIOR_VAR  # log-odds^2, latent variance of unobserved points
+    prior_var: float = (
+        PRIOR_VAR  # log-odds^2, latent variance of unobserved points and of weights that no data touched
+    )
     # log-odds^2, what the kernels cannot know: added in the measure that the activation falls short of 1, so that certainty
     # fades with the kernels; at 0 answers grow surer with the distance from all data
     residual_var: float = 0.0
@@ -68,6 +73,8 @@ class AnswerRule:
         for name, value in self.fields().items():
             if not 0.0 <= value < math.inf:
                 raise ValueError(f"{name}: {value}, need a finite number from 0")
+            if name == "prior_var" and value == 0.0:
+                raise ValueError("prior_var: 0, need a positive number")
             object.__setattr__(
                 self, name, float(value)
             )  # numpy's own scalars would decide the answers' dtype
@@ -94,7 +101,7 @@ class LatentSums(NamedTuple):
 
     mean: Float  # (N,) sum_m w_m phi_m, log-odds
     var: Float  # (N,) sum_m var_m phi_m^2, log-odds^2
-    activation: Float  # (N,) sum_m phi_m
+    activation: Float  # (N,) sum_m known_m phi_m
 
 
 class LatentGradients(NamedTuple):
@@ -120,6 +127,12 @@ class AnswerGradients(NamedTuple):
 
     mean: Float64  # (N, 3) 1/m
     latent_mean: Float64  # (N, 3) log-odds/m
+
+
+def known(weight_var: Float, rule: AnswerRule) -> Float:
+    """(K,) what is known of weights with these variances, log-odds^2: from 0, all that the prior leaves open, to 1."""
+    share: Float = np.maximum(1.0 - weight_var / rule.prior_var, 0.0)
+    return share
 
 
 def answer(sums: LatentSums, rule: AnswerRule) -> Answer:

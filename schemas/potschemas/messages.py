@@ -134,9 +134,9 @@ class Kernels(Message, frozen=True, kw_only=True):
     gamma_rate: Array  # (K,) float32, m^2, > 0; the mean of gamma is shape / rate, in 1/m^2
     weight_mean: Array  # (K,) float32, log-odds
     weight_var: Array  # (K,) float32, log-odds^2
-    observed_activation: Finite  # summed activation below which a point is unobserved
+    observed_activation: Finite  # summed activation of known weights, below which a point is unobserved
     prior_var: Finite  # log-odds^2, of the latent where nothing was observed
-    residual_var: Finite  # log-odds^2, added in the measure that the summed activation falls short of 1
+    residual_var: Finite  # log-odds^2, added in the measure that this sum falls short of 1
     mean_moderation: Finite = 1.0  # share of the latent variance that pulls the mean towards 0.5
 
 
@@ -405,9 +405,9 @@ class TilesPart(Message, frozen=True, kw_only=True):
     counts: Packed  # (T,) int64, kernels of each tile in this part, at least 1
     gone: Packed | None = None  # (3, G) int64, indices of tiles known to the asker and not there; in part 0
     kernels: CodedKernels  # of the tiles one after the other
-    observed_activation: Finite  # summed activation below which a point is unobserved
+    observed_activation: Finite  # summed activation of known weights, below which a point is unobserved
     prior_var: Finite  # log-odds^2, of the latent where nothing was observed
-    residual_var: Finite  # log-odds^2, added in the measure that the summed activation falls short of 1
+    residual_var: Finite  # log-odds^2, added in the measure that this sum falls short of 1
     mean_moderation: Finite  # share of the latent variance that pulls the mean towards 0.5
 
 
@@ -512,9 +512,9 @@ class Info(Message, frozen=True, kw_only=True):
     lower: Vector3 | None  # m, map frame; bounds of the hinge means, none while the map is empty
     upper: Vector3 | None  # m, map frame
     tile_size_m: Positive  # m, edge of a tile
-    observed_activation: Finite  # summed activation below which a point is unobserved
+    observed_activation: Finite  # summed activation of known weights, below which a point is unobserved
     prior_var: Finite  # log-odds^2, of the latent where nothing was observed
-    residual_var: Finite  # log-odds^2, added in the measure that the summed activation falls short of 1
+    residual_var: Finite  # log-odds^2, added in the measure that this sum falls short of 1
     mean_moderation: Finite = 1.0  # share of the latent variance that pulls the mean towards 0.5
     limits: Limits  # what the server accepts
     started_ns: Sequence  # when the server started

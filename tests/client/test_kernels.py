@@ -52,7 +52,7 @@ def slow_answer(
         )
         mu += float(ks.weight_mean[m]) * phi
         s2 += float(ks.weight_var[m]) * phi * phi
-        activation += phi
+        activation += max(0.0, 1.0 - float(ks.weight_var[m]) / ks.rule.prior_var) * phi
     s2 += ks.rule.residual_var * max(0.0, 1.0 - activation)
     observed = activation >= ks.rule.observed_activation
     if not observed:

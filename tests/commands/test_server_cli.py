@@ -146,7 +146,7 @@ def test_variables_are_read(capsys: pytest.CaptureFixture[str], monkeypatch: pyt
         (["config", "show", "--set", "atoms.save=true"], "need the setting `dictionary`"),
         (["config", "show", "--set", "atoms.admission.min_auc=1"], "atoms.admission"),
         (["serve", "--map", "A"], "is not an id"),
-        (["demo", "--profile", "none"], "need one of default, sharp, paper"),
+        (["demo", "--profile", "none"], "need one of default, paper"),
         (["demo", "/no/such/recording"], "/no/such/recording"),
     ],
 )

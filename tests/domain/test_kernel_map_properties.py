@@ -65,7 +65,7 @@ def test_more_variance_pulls_the_mean_towards_one_half(seed: int, k: int, factor
     sure = case.map().occupancy(case.points)
     unsure = case.map(weight_var=case.var * factor).occupancy(case.points)
     assert (np.abs(unsure.mean - 0.5) <= np.abs(sure.mean - 0.5) + CLOSE).all()
-    np.testing.assert_array_equal(sure.observed, unsure.observed)
+    assert not (unsure.observed & ~sure.observed).any(), "less is known of the weights"
 
 
 @given(seed=SEEDS, k=st.integers(1, 200), cut=st.integers(0, 40))

@@ -216,7 +216,7 @@ def test_a_label_says_what_ran() -> None:
     assert label_of(MappingSettings()) == "default"
     assert label_of(MappingSettings.of_profile("paper")) == "paper"
     assert (
-        label_of(MappingSettings(fade_rate=0.0, max_range_m=9.0)) == "default, max_range_m=9.0, fade_rate=0.0"
+        label_of(MappingSettings(gone_odds=0.0, max_range_m=9.0)) == "default, max_range_m=9.0, gone_odds=0.0"
     )
 
 

@@ -120,16 +120,16 @@ def _box_points(n: int = 300) -> np.ndarray:
 @pytest.mark.parametrize("looks", [1, 12])
 def test_what_has_left_is_gone_after_a_few_scans_that_see_through(looks: int) -> None:
     gone = {}
-    for fade_rate in (0.0, 0.05):
-        service = _service(fade_rate=fade_rate)
+    for gone_odds in (0.0, 300.0):
+        service = _service(gone_odds=gone_odds)
         for k in range(looks):
             service.integrate(_scan(k, box=True, n=6000))
         assert service.snapshot.occupancy(_box_points()).mean.mean() > 0.8
         for k in range(6):
             service.integrate(_scan(50 + k, n=6000))
-        gone[fade_rate] = service.snapshot.occupancy(_box_points()).mean.mean()
-    assert gone[0.05] < 0.4
-    assert gone[0.05] < 0.7 * gone[0.0], "without fading, hits and free points argue for long"
+        gone[gone_odds] = service.snapshot.occupancy(_box_points()).mean.mean()
+    assert gone[300.0] < 0.4
+    assert gone[300.0] < 0.7 * gone[0.0], "hits and free points alone argue for long"
 
 
 def _with_pole(seed: int, radius_m: float) -> Scan:

@@ -15,7 +15,7 @@ NUMBERS = [f.name for f in dataclasses.fields(MappingSettings) if isinstance(f.d
 
 def test_profiles_by_name() -> None:
     assert MappingSettings.of_profile("default") == MappingSettings()
-    assert [MappingSettings.of_profile(name).profile for name in PROFILES] == ["default", "sharp", "paper"]
+    assert [MappingSettings.of_profile(name).profile for name in PROFILES] == ["default", "paper"]
     with pytest.raises(SettingsError, match="papr"):
         MappingSettings.of_profile("papr")
     with pytest.raises(SettingsError, match=r"mapping\.profile"):

@@ -1,26 +1,30 @@
 """Evidence: all labelled points ever seen, as one weighted pseudo-datum (a row) a voxel, label and source.
 
-`rows` keeps them, `joining` adds samples while it keeps rows few, `fading` weakens what beams see through.
+`rows` keeps them, `joining` adds samples while it keeps rows few, `leaving` takes out what has left.
 """
 
-from potserver.numerics.evidence.fading import SeenThrough, see_through
 from potserver.numerics.evidence.joining import TURNS, Joined, add_sparing
+from potserver.numerics.evidence.leaving import SeenThrough, see_through
 from potserver.numerics.evidence.rows import (
     FREE,
     HIT,
+    KINDS,
     LABELS,
+    MISSED,
     NEAR,
+    PASSED,
     SHADOW,
     Added,
     Cells,
     Rows,
     add,
     cells,
-    clip_shadows,
+    clip,
     counts,
     decay,
     forget,
     is_alive,
+    is_label,
     positions,
     tile_of,
 )
@@ -28,8 +32,11 @@ from potserver.numerics.evidence.rows import (
 __all__ = [
     "FREE",
     "HIT",
+    "KINDS",
     "LABELS",
+    "MISSED",
     "NEAR",
+    "PASSED",
     "SHADOW",
     "TURNS",
     "Added",
@@ -40,11 +47,12 @@ __all__ = [
     "add",
     "add_sparing",
     "cells",
-    "clip_shadows",
+    "clip",
     "counts",
     "decay",
     "forget",
     "is_alive",
+    "is_label",
     "positions",
     "see_through",
     "tile_of",

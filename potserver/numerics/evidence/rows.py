@@ -4,10 +4,11 @@ A row belongs to one voxel, one kind and one source (a robot). It holds the weig
 weighted sum of their positions relative to the voxel's centre. So a row stands at the mean of its samples, rows of two maps can
 be added, and a source's samples can be taken off again. There are at most as many rows as voxels times kinds times sources.
 
-There are four kinds. `HIT` is where an echo came from, label 1. `FREE` is what a beam crossed, label 0. `NEAR` is free space
-just before a face, label 0, kept apart so that faces stay sharp. `SHADOW` is what lies behind a hit: nobody saw it, so its
-label is one half, it counts next to nothing, and only where there is no other row. Hits and near samples have voxels of half
-the resolution, the others voxels of the resolution.
+There are six kinds. Four are labels: `HIT` is where an echo came from, label 1. `FREE` is what a beam crossed, label 0. `NEAR`
+is free space just before a face, label 0, kept apart so that faces stay sharp. `SHADOW` is what lies behind a hit: nobody saw
+it, so its label is one half, it counts next to nothing, and only where nothing was seen to be free. `PASSED` and `MISSED` are
+no labels but tallies of beams, beside hits, see `leaving`. Free samples and shadows have voxels of the resolution, the others
+of half of it.
 
 All functions are pure but for `forget`, which scales sums in place.
 """
@@ -24,12 +25,14 @@ from potserver.numerics.arrays import Bool, Float32, Float64, Int16, Int32, Int6
 from potserver.numerics.voxel_hash import empty_table, enter, find, pack
 
 FREE, HIT, SHADOW, NEAR = 0, 1, 2, 3  # kinds; the odd ones have voxels of half the resolution
-LABELS = np.array(
-    [0.0, 1.0, 0.5, 0.0], np.float32
-)  # of the kinds: the share of occupied looks that they stand for
+PASSED, MISSED = 5, 7
+KINDS = (FREE, HIT, SHADOW, NEAR, PASSED, MISSED)
+# of the kinds: the share of occupied looks that they stand for
+LABELS = np.full(8, np.nan, np.float32)
+LABELS[[FREE, HIT, SHADOW, NEAR]] = 0.0, 1.0, 0.5, 0.0
 
 _SEEN = 0.05  # looks of a cell from which on it counts as seen
-_SHADOW_COUNT = 0.1  # looks that a shadow counts as in a fit
+_SHADOW_COUNT = 0.15  # looks that a shadow counts as in a fit
 _LEAST_WEIGHT = 1e-3  # a row with less is taken for empty
 _INSIDE = 0.5 - 1e-6  # voxels: how far from the centre a row may stand
 
@@ -38,7 +41,7 @@ class Rows(NamedTuple):
     """R pseudo-data in one frame."""
 
     voxel: Int32  # (R, 3) voxel numbers from the frame's origin, in voxels of the row's kind
-    kind: UInt8  # (R,) FREE, HIT, SHADOW or NEAR
+    kind: UInt8  # (R,) FREE, HIT, SHADOW, NEAR, PASSED or MISSED
     sums: Float32  # (R, 4) sum of w (x - centre) for each axis, m; sum of w
     source: Int16  # (R,) number of the robot that saw it
 
@@ -158,6 +161,11 @@ def _positions(voxel, kind, sums, fine_m):
     return out
 
 
+def is_label(rows: Rows) -> Bool:
+    """(R,) which rows say whether their place is occupied; the others are tallies."""
+    return rows.kind < PASSED
+
+
 def is_alive(rows: Rows) -> Bool:
     """(R,) which rows have weight left."""
     return rows.sums[:, 3] > _LEAST_WEIGHT
@@ -202,35 +210,42 @@ def cells(rows: Rows) -> Cells:
     return Cells(number, n)
 
 
-def forget(sums: Float32, gained: Float32, cells: Cells, limit: float) -> None:
+def forget(rows: Rows, gained: Float32, cells: Cells, limit: float) -> None:
     """Scale old evidence down, in place, so that no cell keeps more than `limit` of weight. Cells without new evidence stay.
 
     Args:
-        sums: (R, 4) of the rows, what was gained included.
+        rows: What was gained included; tallies are left alone.
         gained: (R,) the part of the weights that is new.
         cells: Of the rows.
         limit: Weight of a cell. New evidence that exceeds it alone is scaled down to it.
     """
-    _forget(sums, gained, cells.number, cells.n, limit)
+    _forget(rows.sums, gained, is_label(rows), cells.number, cells.n, limit)
 
 
 def counts(rows: Rows, cells: Cells, saturation: float) -> Float32:
     """(R,) what each row counts in a fit: its weight / (1 + weight of its cell / saturation).
 
     Looks at one place repeat each other. So a cell counts for less than `saturation` looks, shared among its rows by weight.
-    Shadows count a tenth of a look where their cell has no other row, and nothing elsewhere.
+    Shadows count a part of a look where nothing in their cell was seen to be free, and nothing elsewhere; tallies never count.
     """
     is_shadow = rows.kind == SHADOW
-    weight = np.where(is_shadow, np.float32(0), np.maximum(rows.sums[:, 3], np.float32(0)))
+    is_seen = is_label(rows) & ~is_shadow
+    weight = np.where(is_seen, np.maximum(rows.sums[:, 3], np.float32(0)), np.float32(0))
     total = np.bincount(cells.number, weight, cells.n)[cells.number]
-    shadow = np.where(total < _SEEN, np.float32(_SHADOW_COUNT), np.float32(0))
+    free = np.bincount(cells.number, np.where(rows.kind == HIT, np.float32(0), weight), cells.n)[cells.number]
+    shadow = np.where(free < _SEEN, np.float32(_SHADOW_COUNT), np.float32(0))
     return np.where(is_shadow, shadow, weight / (1.0 + total / saturation)).astype(np.float32)
 
 
-def clip_shadows(rows: Rows) -> None:
-    """Let no shadow weigh more than one look, in place: that nobody saw a place says no more when it is said again."""
-    heavy = np.flatnonzero((rows.kind == SHADOW) & (rows.sums[:, 3] > 1.0))
-    rows.sums[heavy] /= rows.sums[heavy, 3:]
+def clip(rows: Rows, memory: float) -> None:
+    """Bound what rows weigh that are not forgotten by cell, in place.
+
+    A shadow weighs one look at most: that nobody saw a place says no more when it is said again. A tally keeps `memory` beams.
+    """
+    most = np.full(len(LABELS), np.inf, np.float32)
+    most[SHADOW], most[[PASSED, MISSED]] = 1.0, memory
+    heavy = np.flatnonzero(rows.sums[:, 3] > most[rows.kind])
+    rows.sums[heavy] *= (most[rows.kind[heavy]] / rows.sums[heavy, 3])[:, None]
 
 
 def decay(rows: Rows, factor: float) -> Rows:
@@ -293,15 +308,16 @@ def _cells(voxel, kind, table):
 
 
 @nb.njit(nogil=True, error_model="numpy", cache=True)
-def _forget(sums, gained, cell, n_cells, limit):
+def _forget(sums, gained, is_label, cell, n_cells, limit):
     total = np.zeros(n_cells)
     new = np.zeros(n_cells)
     for r in range(len(cell)):
-        total[cell[r]] += sums[r, 3]
-        new[cell[r]] += max(gained[r], 0.0)
+        if is_label[r]:
+            total[cell[r]] += sums[r, 3]
+            new[cell[r]] += max(gained[r], 0.0)
     for r in range(len(cell)):
         t, g = total[cell[r]], new[cell[r]]
-        if g <= 0.0 or t <= limit or sums[r, 3] <= 0.0:
+        if not is_label[r] or g <= 0.0 or t <= limit or sums[r, 3] <= 0.0:
             continue
         keep_new = min(1.0, limit / g)
         keep_old = max(limit - g, 0.0) / (t - g) if t - g > 1e-9 else 0.0

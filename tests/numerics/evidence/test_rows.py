@@ -13,7 +13,7 @@ from potserver.numerics.evidence import (
     SHADOW,
     add,
     cells,
-    clip_shadows,
+    clip,
     counts,
     decay,
     forget,
@@ -61,18 +61,18 @@ def test_old_evidence_gives_way_to_new() -> None:
     rows = rows_of(np.tile([0.1, 0.1, 0.1], (100, 1)), True)
     rows, gained = add(rows, np.tile([0.15, 0.1, 0.1], (30, 1)), np.zeros(30, bool), np.ones(30), FINE_M)
     where = positions(rows, FINE_M)
-    forget(rows.sums, gained, cells(rows), 50.0)
+    forget(rows, gained, cells(rows), 50.0)
     np.testing.assert_allclose(rows.sums[:, 3], [20.0, 30.0], rtol=1e-5)
     np.testing.assert_allclose(positions(rows, FINE_M), where, atol=1e-6)
     # one scan alone above the limit is scaled itself
     rows, gained = add(rows, np.tile([0.15, 0.1, 0.1], (200, 1)), np.zeros(200, bool), np.ones(200), FINE_M)
-    forget(rows.sums, gained, cells(rows), 50.0)
+    forget(rows, gained, cells(rows), 50.0)
     np.testing.assert_allclose(rows.sums[:, 3], [0.0, 50.0], atol=1e-3)
 
 
 def test_cells_without_new_evidence_forget_nothing() -> None:
     rows = rows_of(np.tile([0.1, 0.1, 0.1], (100, 1)), True)
-    forget(rows.sums, np.zeros(1, np.float32), cells(rows), 50.0)
+    forget(rows, np.zeros(1, np.float32), cells(rows), 50.0)
     assert rows.sums[0, 3] == 100.0
 
 
@@ -104,6 +104,6 @@ def test_a_shadow_counts_only_where_nobody_looked() -> None:
 def test_a_shadow_weighs_one_look_however_often_it_falls() -> None:
     rows = rows_of(np.tile([0.1, 0.1, 0.1], (9, 1)), np.full(9, SHADOW, np.uint8))
     where = positions(rows, FINE_M)
-    clip_shadows(rows)
+    clip(rows, 200.0)
     assert rows.sums[0, 3] == pytest.approx(1.0)
     np.testing.assert_allclose(positions(rows, FINE_M), where, atol=1e-6)

@@ -1,0 +1,330 @@
+"""Leaving: hits that beams pass through without an echo are gone once chance no longer explains it.
+
+Each voxel of hits keeps two tallies beside its hits. `PASSED` counts the beams that went through while the place still gave
+echoes: much of it means a fence, a bush, a thin pole, or a surface at a grazing angle. `MISSED` counts those since the last
+echo. How often a beam gives an echo there is not known but from h hits and m passed, so it has a Beta distribution, and k
+beams in a row miss what is still there with a probability of
+
+    B(h + 1/2, m + k + 1/2) / B(h + 1/2, m + 1/2)                                               (Jeffreys' prior)
+
+When that falls below one in `odds`, what stood there has left. Nothing in this depends on the range, the sensor or the
+background: a far box of few echoes takes more scans than a near one of many, and a fence that lets nine of ten beams through
+stays. Voxels of missed hits that touch each other count together: they are one thing.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numba as nb
+import numpy as np
+
+from potserver.numerics.arrays import Bool, Float64, Int32, Int64, UInt8
+from potserver.numerics.beams import Beams
+from potserver.numerics.evidence.rows import FREE, HIT, MISSED, PASSED, Rows, is_alive, positions
+from potserver.numerics.geometry import bounds
+from potserver.numerics.threads import parallel_map, spans
+from potserver.numerics.voxel_hash import any_around, empty_table, find, pack
+
+_BEHIND = 0.75  # resolutions that a beam must go on behind a hit to have passed through it; less is a graze, or noise
+_ALONG = (
+    2  # voxels: hits that a beam passes so near to each other share its one pass, for it may graze a surface
+)
+_PRIOR = 0.5  # of an echo, and of none: beams that each voxel has had before any were counted
+_ONE_SCAN = 3.0  # misses, at most: beams of one scan lie in the same ring, and miss a wire together
+_WALK = 0.75  # step of a walk along a beam, in voxels of hits
+_BLOCK_SHIFT, _MAX_BLOCKS = 1, 2**22  # blocks of 2^shift voxels of hits along an edge
+_SPANS = 8  # of beams; the number of threads plays no part in how they are cut
+
+
+class SeenThrough(NamedTuple):
+    """Samples that say where beams went through hits: tallies, and free space where things have left."""
+
+    points: Float64  # (P, 3) m, in the rows' frame
+    kind: UInt8  # (P,) PASSED, MISSED or FREE
+    weight: Float64  # (P,) beams
+
+    @staticmethod
+    def nothing() -> SeenThrough:
+        """No samples."""
+        return SeenThrough(np.zeros((0, 3)), np.zeros(0, np.uint8), np.zeros(0))
+
+
+class _Hits(NamedTuple):
+    """The voxels of H rows of hits, ready to be looked up. A voxel is numbered by its last row."""
+
+    voxel: Int32  # (H, 3)
+    table: Int32
+    keys: Int64  # (H,)
+    corner: Int32  # (3,) voxel at the lower corner of the blocks
+    shift: int  # a block has 2^shift voxels along an edge
+    is_near: Bool  # (X, Y, Z) which blocks have hits
+
+    @staticmethod
+    def of(voxel: Int32) -> _Hits:
+        table = empty_table(len(voxel))
+        keys = _enter_voxels(voxel, table)
+        corner, shift, is_near = _blocks_of(voxel)
+        return _Hits(voxel, table, keys, corner, shift, is_near)
+
+
+class _Passes(NamedTuple):
+    """P passes of a beam through a voxel with hits, in the order in which each beam goes."""
+
+    hit: Int32  # (P,) the voxel's number
+    beam: Int32  # (P,)
+
+
+class _Tallies(NamedTuple):
+    """What each of H voxels of hits has had so far, by its number."""
+
+    of_row: Int64  # (R,) the number of the voxel that a row of hits or tallies belongs to; -1: none
+    hits: Float64  # (H,)
+    passed: Float64  # (H,)
+    missed: Float64  # (H,)
+
+
+def see_through(
+    rows: Rows,
+    beams: Beams,
+    origin: Float64,
+    *,
+    fine_m: float,
+    odds: float,
+    most_followed: int = 15_000,
+    threads: int = 1,
+) -> SeenThrough:
+    """Take out hits that have left, in place, and say what else the beams of a scan tell about hits that they pass through.
+
+    A beam passes through the voxels of hits on its way, up to three quarters of a resolution before its end. Where it passes
+    several within two voxels of each other, each gets its share of one beam: it may graze a surface. A voxel is still there
+    if an echo of the scan lies in it or in one that touches it.
+
+    Args:
+        rows: The sums of rows of hits and tallies are changed.
+        beams: B beams, relative to their start.
+        origin: (3,) m, the beams' start in the rows' frame.
+        fine_m: The resolution.
+        odds: Against missing what is still there; beyond them it has left.
+        most_followed: Beams. Of more, every second, third ... is followed, and counts for those left out.
+        threads: Threads to spread the beams over.
+    Returns:
+        Samples to add: tallies at the centres of their voxels, free space where the rows stood that were taken out.
+    """
+    hit_rows = np.flatnonzero(rows.occupied & is_alive(rows))
+    ends = beams.ends + origin
+    new = np.floor(ends[beams.is_return] / (0.5 * fine_m)).astype(np.int32)
+    voxel = np.concatenate([new, rows.voxel[hit_rows]])
+    if len(voxel) == 0 or len(ends) == 0:
+        return SeenThrough.nothing()
+    hits = _Hits.of(voxel)
+    every = -(-len(ends) // most_followed)
+    followed = Beams(ends[::every], beams.is_return[::every])
+    passes = _follow(followed, origin, hits, fine_m, threads)
+    tallies = _Tallies(*_tallies(rows.voxel, rows.kind, rows.sums[:, 3], hits.table, hits.keys))
+    passing = every * np.bincount(passes.hit, _shares(hits.voxel, *passes), len(voxel))
+    asked = np.flatnonzero((passing > 0) | (tallies.missed > 0))
+    is_missed = _is_lonely(hits.voxel[asked], new, empty_table(len(new)))
+    there, missed = asked[~is_missed], asked[is_missed]
+    beams_around, hits_around, passed_around = (
+        _around(missed, of_voxel, hits.voxel, hits.table, hits.keys)
+        for of_voxel in (passing, tallies.hits, tallies.passed)
+    )
+    new_misses = -_ONE_SCAN * np.expm1(-beams_around / _ONE_SCAN)
+    in_a_row = tallies.missed[missed] + new_misses
+    has_left = _log_missed(hits_around, passed_around, in_a_row) < -np.log(odds)
+    gone = missed[has_left]
+    still = missed[~has_left]
+    where = positions(rows.take(hit_rows[gone - len(new)]), fine_m)
+    _take_out(rows, tallies, there, gone)
+    centres = (hits.voxel + 0.5) * (0.5 * fine_m)
+    return SeenThrough(
+        np.concatenate([centres[there], centres[still], where]),
+        np.repeat(np.array([PASSED, MISSED, FREE], np.uint8), [len(there), len(still), len(gone)]),
+        np.concatenate([(tallies.missed + passing)[there], new_misses[~has_left], in_a_row[has_left]]),
+    )
+
+
+def _take_out(rows: Rows, tallies: _Tallies, there: Int64, gone: Int64) -> None:
+    """Empty rows in place: what was missed where something is still there, and all of what has left."""
+    is_there, is_gone = np.zeros((2, len(tallies.hits) + 1), np.bool_)  # the last one is of rows of no voxel
+    is_there[there], is_gone[gone] = True, True
+    is_missed = rows.kind == MISSED
+    is_tally = is_missed | (rows.kind == PASSED)
+    out = is_gone[tallies.of_row] | (is_missed & is_there[tallies.of_row]) | (is_tally & (tallies.of_row < 0))
+    rows.sums[out] = 0.0
+
+
+def _follow(beams: Beams, origin: Float64, hits: _Hits, fine_m: float, threads: int) -> _Passes:
+    """Where beams pass through voxels with hits; their ends are in the rows' frame."""
+
+    def run(span: tuple[int, int]) -> _Passes:
+        a, b = span
+        room = 4 * (b - a) + 1024
+        while True:
+            found, beam = np.empty(room, np.int32), np.empty(room, np.int32)
+            n = _passes(beams.ends[a:b], origin, hits, fine_m, found, beam)
+            if n <= room:
+                return _Passes(found[:n], beam[:n] + np.int32(a))
+            room = n
+
+    parts = parallel_map(run, spans(len(beams.ends), _SPANS), threads)
+    return _Passes(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
+
+
+@nb.njit(nogil=True, error_model="numpy", cache=True)
+def _log_missed(hits, passed, in_a_row):
+    """(V,) log of the probability that so many beams in a row miss a voxel of so many hits and passes that is still there."""
+    out = np.empty(len(hits))
+    for v in range(len(hits)):
+        echo, none = hits[v] + _PRIOR, passed[v] + _PRIOR
+        out[v] = (
+            math.lgamma(none + in_a_row[v])
+            - math.lgamma(none)
+            + math.lgamma(echo + none)
+            - math.lgamma(echo + none + in_a_row[v])
+        )
+    return out
+
+
+@nb.njit(nogil=True, error_model="numpy", cache=True)
+def _enter_voxels(voxel, table):
+    """Keys; a voxel's entry is its last row: each source has a row of its own."""
+    keys = np.empty(len(voxel), np.int64)
+    for i in range(len(voxel)):
+        keys[i] = pack(1, voxel[i, 0], voxel[i, 1], voxel[i, 2])
+        table[find(table, keys, keys[i])] = i
+    return keys
+
+
+@nb.njit(nogil=True, error_model="numpy", cache=True)
+def _tallies(voxel, kind, weight, table, keys):
+    """See `_Tallies`; the table and the keys are of the voxels of hits."""
+    of_row = np.full(len(kind), -1, np.int64)
+    hits, passed, missed = np.zeros(len(keys)), np.zeros(len(keys)), np.zeros(len(keys))
+    for r in range(len(kind)):
+        if not (kind[r] == HIT or kind[r] == PASSED or kind[r] == MISSED):
+            continue
+        number = table[find(table, keys, pack(1, voxel[r, 0], voxel[r, 1], voxel[r, 2]))]
+        of_row[r] = number
+        if number < 0:
+            continue
+        if kind[r] == HIT:
+            hits[number] += weight[r]
+        elif kind[r] == PASSED:
+            passed[number] += weight[r]
+        else:
+            missed[number] += weight[r]
+    return of_row, hits, passed, missed
+
+
+@nb.njit(nogil=True, error_model="numpy", cache=True)
+def _around(chosen, of_voxel, voxel, table, keys):
+    """(C,) sums of a number that each voxel has, over those of the chosen voxels that are each one or touch it."""
+    is_chosen = np.zeros(len(voxel), np.bool_)
+    is_chosen[chosen] = True
+    out = np.zeros(len(chosen))
+    for i in range(len(chosen)):
+        x, y, z = voxel[chosen[i]]
+        for dx in range(-1, 2):
+            for dy in range(-1, 2):
+                for dz in range(-1, 2):
+                    number = table[find(table, keys, pack(1, x + dx, y + dy, z + dz))]
+                    if number >= 0 and is_chosen[number]:
+                        out[i] += of_voxel[number]
+    return out
+
+
+@nb.njit(nogil=True, error_model="numpy", cache=True)
+def _shares(voxel, hit, beam):
+    """(P,) the share of its beam that each pass gets: passes through voxels near each other are one."""
+    shares = np.empty(len(hit))
+    for i in range(len(hit)):
+        n = 1
+        for step in (-1, 1):
+            j = i + step
+            while 0 <= j < len(hit) and beam[j] == beam[i]:
+                apart = 0
+                for c in range(3):
+                    apart = max(apart, abs(voxel[hit[j], c] - voxel[hit[i], c]))
+                if apart > _ALONG:
+                    break
+                n += 1
+                j += step
+        shares[i] = 1.0 / n
+    return shares
+
+
+def _blocks_of(voxel: Int32) -> tuple[Int32, int, Bool]:
+    """Which blocks of 2^shift voxels along an edge hold any of (V, 3) voxels: their lower corner, the shift, a flag a block.
+
+    Most of a beam's way leads through blocks without hits, and a flag is looked up faster than a voxel.
+    """
+    corner, last = bounds(voxel)
+    shift = _BLOCK_SHIFT
+    while np.prod(((last - corner) >> shift).astype(np.float64) + 1.0) > _MAX_BLOCKS:
+        shift += 1
+    is_near = np.zeros(((last - corner) >> shift) + 1, bool)
+    is_near[tuple(((voxel - corner) >> shift).T)] = True
+    return corner, shift, is_near
+
+
+@nb.njit(nogil=True, error_model="numpy", cache=True)
+def _passes(ends, origin, hits, fine_m, found, beam):
+    """How often beams pass through voxels with hits; which voxels and beams, as far as `found` and `beam` have room.
+
+    The buffers do not grow in here: numba would count references in every step, which takes three times as long.
+    """
+    table, keys, corner, shift, is_near = hits.table, hits.keys, hits.corner, hits.shift, hits.is_near
+    n = 0
+    edge = 0.5 * fine_m
+    ox, oy, oz = origin[0] / edge, origin[1] / edge, origin[2] / edge  # from here on in voxels
+    for b in range(len(ends)):
+        dx, dy, dz = ends[b, 0] / edge - ox, ends[b, 1] / edge - oy, ends[b, 2] / edge - oz
+        length = np.sqrt(dx * dx + dy * dy + dz * dz)
+        if length <= 0.0:
+            continue
+        dx /= length
+        dy /= length
+        dz /= length
+        stop = length - 2.0 * _BEHIND
+        s = 0.5 * _WALK
+        last = np.int64(-1)
+        while s < stop:
+            x = np.int64(np.floor(ox + dx * s))
+            y = np.int64(np.floor(oy + dy * s))
+            z = np.int64(np.floor(oz + dz * s))
+            s += _WALK
+            i, j, k = (x - corner[0]) >> shift, (y - corner[1]) >> shift, (z - corner[2]) >> shift
+            if not (0 <= i < is_near.shape[0] and 0 <= j < is_near.shape[1] and 0 <= k < is_near.shape[2]):
+                continue
+            if not is_near[i, j, k]:
+                continue
+            key = pack(1, x, y, z)
+            if key == last:
+                continue
+            last = key
+            r = table[find(table, keys, key)]
+            if r < 0:
+                continue
+            if n < len(found):
+                found[n] = r
+                beam[n] = b
+            n += 1
+    return n
+
+
+@nb.njit(nogil=True, error_model="numpy", cache=True)
+def _is_lonely(voxel, new, table):
+    """(V,) whether none of the new voxels is a voxel or touches it."""
+    keys = np.empty(len(new), np.int64)
+    for i in range(len(new)):
+        keys[i] = pack(1, new[i, 0], new[i, 1], new[i, 2])
+        place = find(table, keys, keys[i])
+        if table[place] < 0:
+            table[place] = i
+    lonely = np.empty(len(voxel), np.bool_)
+    for i in range(len(voxel)):
+        lonely[i] = not any_around(table, keys, 1, voxel[i], 1)
+    return lonely
