@@ -24,15 +24,20 @@ class Latent(NamedTuple):
 
 
 def latent(
-    points: ArrayLike, hinge: ArrayLike, gamma: ArrayLike, weight: ArrayLike, variance: ArrayLike
+    points: ArrayLike,
+    hinge: ArrayLike,
+    gamma: ArrayLike,
+    weight: ArrayLike,
+    variance: ArrayLike,
+    prior_var: float = 100.0,
 ) -> Latent:
-    """Eq. 1 in float64: every kernel at every point."""
+    """Eq. 1 in float64: every kernel at every point; the activation by what is known of the weights."""
     arrays = (np.ascontiguousarray(a, np.float64) for a in (points, hinge, gamma, weight, variance))
-    return Latent(*_latent(*arrays))
+    return Latent(*_latent(*arrays, prior_var))
 
 
 @nb.njit(cache=True)
-def _latent(points, hinge, gamma, weight, variance):
+def _latent(points, hinge, gamma, weight, variance, prior_var):
     sums = np.zeros((3, len(points)))
     for i in range(len(points)):
         for m in range(len(hinge)):
@@ -42,7 +47,7 @@ def _latent(points, hinge, gamma, weight, variance):
             phi = np.exp(-gamma[m] * d2)
             sums[0, i] += weight[m] * phi
             sums[1, i] += variance[m] * phi * phi
-            sums[2, i] += phi
+            sums[2, i] += max(1.0 - variance[m] / prior_var, 0.0) * phi
     return sums
 
 

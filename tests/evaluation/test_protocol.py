@@ -228,7 +228,7 @@ def test_our_map_is_the_services() -> None:
     assert size.cells == len(service.kernel_map) > 0
     assert size.n_bytes == kernel_bytes(service.kernel_map.kernels) == 40 * size.cells
     mean, observed, var = service.occupancy(
-        np.array([[WALL_M, 0.0, 0.0], [2.0, 0.0, 0.0], [500.0, 0.0, 0.0]])
+        np.array([[WALL_M + 0.1, 0.0, 0.0], [2.0, 0.0, 0.0], [500.0, 0.0, 0.0]])
     )
     assert mean[0] > 0.8
     assert mean[1] < 0.2

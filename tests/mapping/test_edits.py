@@ -89,7 +89,6 @@ def test_two_robots_maps_merge_into_what_one_server_would_hold(planar: bool) -> 
     points, occupied = _asked()
     if planar:
         points[:, 2] = 0.0
-    alone = _nll(one.snapshot.occupancy(points), occupied)
     revision = one.snapshot.map_revision
     mine, yours = one.state, other.state
     change = one.merge(yours, np.eye(4))
@@ -106,11 +105,10 @@ def test_two_robots_maps_merge_into_what_one_server_would_hold(planar: bool) -> 
         assert abs(len(merged.snapshot) - len(both.snapshot)) <= 0.02 * len(both.snapshot)
         # normals come of all hits at hand: near samples of the halves lie a little otherwise
         assert np.abs(answer.mean - truth.mean).mean() < 0.015
-        assert _nll(answer, occupied) < _nll(truth, occupied) + 0.015
+        assert _nll(answer, occupied) < _nll(truth, occupied) + 0.005
     np.testing.assert_allclose(
         one.snapshot.occupancy(points).mean, other.snapshot.occupancy(points).mean, atol=0.05
     )
-    assert _nll(one.snapshot.occupancy(points), occupied) < alone
 
 
 def test_a_map_in_another_frame_merges_by_its_transform() -> None:

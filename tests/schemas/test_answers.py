@@ -206,8 +206,8 @@ def test_the_formulas_of_the_contract_are_the_answers(formulas: CodeType, rule: 
     if rule.observed_activation > 0:
         assert (~got.observed).sum() > 5
     if rule.observed_activation < 1:
-        assert (got.observed & (sums.activation < 1)).sum() > 50
-    assert (sums.activation > 1).sum() > 50
+        assert (got.observed & (sums.activation < 1)).sum() > 25
+    assert (sums.activation > 1).sum() > 25
     for name, values in got._asdict().items():
         np.testing.assert_allclose([getattr(t, name) for t in at], values, rtol=1e-12)
     np.testing.assert_allclose([t.gradient for t in at], of_got.mean, rtol=1e-9, atol=1e-12)
