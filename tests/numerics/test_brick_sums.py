@@ -112,7 +112,7 @@ def test_sums_depend_neither_on_threads_nor_on_the_order_of_parts_or_points() ->
     points = points_about(rng, kernels, 4000)
     made, _ = parts_of(kernels)
     one = brick_sums(BrickMap(made), points)
-    other = brick_sums(BrickMap(made[::-1]), points[::-1], threads=3)
+    other = brick_sums(BrickMap(made[::-1]), np.ascontiguousarray(points[::-1]), threads=3)
     for a, b in zip(one, other, strict=True):
         np.testing.assert_array_equal(a, b[::-1])
 
