@@ -34,6 +34,7 @@ BYTES_OF_ROW = 3 * 4 * ROW
 
 _LEAST_FALL = 1.38  # gamma spacing^2, at least: exp(-1.38 * 3^2) is 4e-6
 _SPARSEST = 4  # times the spacing at that fall, at most
+_MOST_NODES = 2**13  # along a tile: kernels narrower than such a lattice needs are looked for one by one
 _OFF_NODE = 1e-5  # spacings by which a kernel may lie beside its node
 _PLANE_STEP_M = 2.0**-30  # planes nearer than this are one
 _MOST_LATTICES = 8  # of one part: each costs every point there
@@ -175,8 +176,10 @@ def _fit_lattices(hinge, tile, gamma, tile_m, table):
     nodes, flat, height = np.zeros(n, np.int64), np.zeros(n, np.bool_), np.zeros(n)
     for g in range(n):
         own = members[start[g] : start[g + 1]]
-        finest = int(tile_m * np.sqrt(gamma[own[0]] / _LEAST_FALL))
         height[g] = hinge[own[0], 2]
+        finest = int(tile_m * np.sqrt(gamma[own[0]] / _LEAST_FALL))
+        if finest > _MOST_NODES:
+            continue
         for candidate in range(finest, max(1, finest // _SPARSEST), -1):
             fits = _fits(hinge, own, candidate / tile_m, height[g])
             if fits:

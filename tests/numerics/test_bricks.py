@@ -64,6 +64,11 @@ def test_kernels_narrower_than_the_products_are_on_the_lattice_too() -> None:
     assert sum(counts(made).values()) == len(kernels.hinge)
 
 
+def test_kernels_far_narrower_than_any_lattice_are_left_over() -> None:
+    kernels = on_lattice(np.random.default_rng(0), 6, 300, lower=(0, 0, 0), upper=(1, 1, 1), fall=1e9)
+    assert parts_of(kernels) == ([], len(kernels.hinge))
+
+
 def test_kernels_with_nothing_in_common_are_left_over() -> None:
     rng = np.random.default_rng(0)
     kernels = Kernels(rng.uniform(-20, 20, (500, 3)), *rng.uniform(0.5, 9.0, (4, 500)))
