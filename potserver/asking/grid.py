@@ -14,6 +14,7 @@ from potserver.domain.kernel_map import KernelMap
 from potserver.domain.types import Float64, Occupancy
 from potserver.errors import BadPointsError, TooLargeError
 from potserver.limits import Limits
+from potserver.numerics.brick_grid import Cells
 
 PART_CELLS = 65_536  # of a part: about a megabyte on the wire, and some tens of milliseconds of work
 _SLACK_CELLS = 5e-7  # so that a box of 10 m at 0.1 m has 100 cells and not 101
@@ -75,5 +76,5 @@ class GridPlan(Plan[GridRun]):
     def part(self, i: int) -> GridRun:
         """The answers at the centres of a run of cells."""
         run = self.items(i)
-        cells = np.stack(np.unravel_index(np.arange(run.start, run.stop), self.shape), axis=1)
-        return GridRun(run.start, self.snapshot.occupancy(self.lower + (cells + 0.5) * self.resolution))
+        cells = Cells(self.lower, self.resolution, self.shape)
+        return GridRun(run.start, self.snapshot.occupancy_of_cells(cells, run.start, run.stop))

@@ -4,47 +4,35 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import cached_property
-from typing import NamedTuple
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from potschemas import answers
-from potschemas.answers import AnswerRule, LatentSums
+from potschemas.answers import AnswerRule, LatentGradients, LatentSums
+from potserver.domain.map_part import MapPart
 from potserver.domain.types import Float32, Float64, KernelSet, Occupancy, Unknown
 from potserver.errors import BadPointsError, ShapeError
 from potserver.numerics import gradients, kernel_index, rays
-from potserver.numerics.threads import default_threads
+from potserver.numerics.brick_grid import Cells, grid_sums
+from potserver.numerics.brick_map import BrickMap
+from potserver.numerics.brick_sums import brick_gradients, brick_sums, brick_widths
+from potserver.numerics.threads import default_threads, parallel_map, spans
 
+T = TypeVar("T")
 
-class IndexedKernels(NamedTuple):
-    """Kernels in the map frame with the index that makes asking them fast."""
-
-    kernels: KernelSet
-    lookup: kernel_index.KernelIndex
-
-    @staticmethod
-    def of(kernels: KernelSet, rule: AnswerRule = AnswerRule()) -> IndexedKernels:
-        """Index kernels for maps with this `observed_activation` and `prior_var`."""
-        lookup = kernel_index.build_index(
-            kernels.hinge_mean,
-            kernels.gamma,
-            kernels.weight_mean,
-            kernels.weight_var,
-            activation_cut=rule.observed_activation / 20.0,
-            prior_var=rule.prior_var,
-        )
-        return IndexedKernels(kernels, lookup)
+_ANSWERED_AT_ONCE = 8192  # points: what their formulas pass through stays in the processor's cache
 
 
 class KernelMap:
-    """K kernels and the index that makes asking them fast. Never changes; any number of threads may query it at once."""
+    """K kernels and what makes asking them fast. Never changes; any number of threads may query it at once."""
 
     def __init__(
         self,
-        kernels: KernelSet | Sequence[IndexedKernels],
+        kernels: KernelSet | Sequence[MapPart],
         *,
         rule: AnswerRule = AnswerRule(),
         map_revision: int = 0,
@@ -53,7 +41,7 @@ class KernelMap:
         """Index the kernels. Answers use the mean of every hinge and every gamma; their dispersions are only kept.
 
         Args:
-            kernels: In the map frame; gamma enters by its mean. Or parts that were indexed before, at the rule's
+            kernels: In the map frame; gamma enters by its mean. Or parts that were made ready before, at the rule's
                 `observed_activation` and `prior_var`, so that only new parts cost time.
             rule: What turns sums over the kernels into answers.
             map_revision: Carried into the answers.
@@ -63,9 +51,11 @@ class KernelMap:
         self.map_revision = map_revision
         self._threads = threads or default_threads()
         if isinstance(kernels, KernelSet):
-            kernels = [IndexedKernels.of(kernels, rule)]
+            kernels = [MapPart.of(kernels, rule)]
         self._parts = tuple(kernels)
         self._index = kernel_index.IndexParts.of([part.lookup for part in self._parts])
+        self._bricks = BrickMap(bricks for part in self._parts for bricks in part.bricks)
+        self._n_kernels = sum(part.n_kernels for part in self._parts)
 
     @cached_property
     def kernels(self) -> KernelSet:
@@ -117,7 +107,12 @@ class KernelMap:
         return cls(kernels, rule=rule, threads=threads)
 
     def __len__(self) -> int:
-        return sum(len(part.kernels) for part in self._parts)
+        return self._n_kernels
+
+    @property
+    def n_off_lattice(self) -> int:
+        """Kernels that stand on no lattice: they are looked for one by one, which takes longer."""
+        return len(self) - len(self._bricks)
 
     def occupancy(self, points: ArrayLike) -> Occupancy:
         """Mean and variance of the occupancy probability, and of the latent, anywhere.
@@ -138,14 +133,40 @@ class KernelMap:
         """
         array = as_points(points)
         sums = self.latent(array)
-        slopes = gradients.latent_gradients(self._whole, array, threads=self._threads, lane="query")
-        of_answer = answers.gradients(sums, slopes, self.rule)
-        return dataclasses.replace(
-            self._answer(sums), gradient=of_answer.mean, latent_gradient=of_answer.latent_mean
+        slopes = brick_gradients(self._bricks, array, threads=self._threads, lane="query")
+        if self.n_off_lattice:
+            more = gradients.latent_gradients(self._rest, array, threads=self._threads, lane="query")
+            slopes = LatentGradients(*(a + b for a, b in zip(slopes, more, strict=True)))
+        pieces = self._in_pieces(
+            lambda cut: answers.gradients(
+                LatentSums(*(s[cut] for s in sums)), LatentGradients(*(s[cut] for s in slopes)), self.rule
+            ),
+            len(array),
         )
+        gradient, of_latent = (np.concatenate(columns) for columns in zip(*pieces, strict=True))
+        return dataclasses.replace(self._answer(sums), gradient=gradient, latent_gradient=of_latent)
+
+    def occupancy_of_cells(self, cells: Cells, first: int, last: int) -> Occupancy:
+        """`occupancy` at the centres of a run of a grid's cells, in C order of (x, y, z); `last` is behind it."""
+        sums = grid_sums(self._bricks, cells, first, last, threads=self._threads, lane="query")
+        if self.n_off_lattice:
+            number = np.stack(np.unravel_index(np.arange(first, last), cells.shape), axis=1)
+            centres = cells.lower + (number + 0.5) * cells.resolution
+            sums = _added(sums, self._rest_sums(centres))
+        return self._answer(sums)
 
     def _answer(self, sums: LatentSums) -> Occupancy:
-        return Occupancy(**answers.answer(sums, self.rule)._asdict(), map_revision=self.map_revision)
+        """What the rule makes of the sums."""
+        pieces = self._in_pieces(
+            lambda cut: answers.answer(LatentSums(*(s[cut] for s in sums)), self.rule), len(sums.mean)
+        )
+        answer = answers.Answer(*(np.concatenate(columns) for columns in zip(*pieces, strict=True)))
+        return Occupancy(**answer._asdict(), map_revision=self.map_revision)
+
+    def _in_pieces(self, function: Callable[[slice], T], n: int) -> list[T]:
+        """What a function makes of n points, some of them at a time; at least once."""
+        cuts = [slice(*span) for span in spans(n, -(-n // _ANSWERED_AT_ONCE))] or [slice(0, 0)]
+        return parallel_map(function, cuts, self._threads, "query")
 
     def first_returns(
         self,
@@ -167,39 +188,55 @@ class KernelMap:
         }
         options = rays.RayOptions(step_m, quantiles, rate[unknown], width_m)
         looks = rays.Rays(origins, directions, max_range_m)
-        return rays.first_returns(self._whole, looks, options, self.rule, threads=self._threads)
+        return rays.first_returns(self._rest, self._bricks, looks, options, self.rule, threads=self._threads)
 
     @cached_property
-    def _whole(self) -> kernel_index.KernelIndex:
-        """One index of all kernels, for questions that walk through the parts; built by the first of them."""
-        if len(self._parts) == 1:
-            return self._parts[0].lookup
-        return IndexedKernels.of(self.kernels, self.rule).lookup
+    def _rest(self) -> kernel_index.KernelIndex:
+        """One index of all kernels on no lattice, for questions that walk through the parts; built by the first of them."""
+        indexed = [part for part in self._parts if len(part.rest)]
+        if len(indexed) == 1:
+            return indexed[0].lookup
+        return MapPart.of(KernelSet.concatenate([part.rest for part in indexed]), self.rule).lookup
+
+    @cached_property
+    def _widths(self) -> rays.Widths:
+        return rays.widths_of(self._rest, self._bricks)
 
     @cached_property
     def typical_width_m(self) -> float:
         """Median over the kernels of sqrt(pi / (2 gamma)): what counts as one trial where nothing was observed."""
-        return rays.typical_width(self._whole)
+        return rays.typical_width(self._widths)
 
     @cached_property
     def fine_step_m(self) -> float:
         """A step that resolves nearly all kernels along a ray."""
-        return rays.fine_step(self._whole)
+        return rays.fine_step(self._widths)
 
     def widths(self, points: Float64) -> Float64:
         """(N,) m: mean of sqrt(pi / (2 gamma)) of the kernels at (N, 3) points, by activation; `typical_width_m` if none."""
-        columns = self._whole.columns.copy()
-        columns[1], columns[2] = rays.kernel_widths(self._whole) * columns[4], 0.0
-        weighted = kernel_index.latent_sums(
-            self._whole._replace(columns=columns), points, threads=self._threads, lane="query"
-        )
-        reached = weighted.activation > 0
-        mean = weighted.mean / np.where(reached, weighted.activation, np.float32(1))
-        return np.where(reached, mean.astype(np.float64), self.typical_width_m)
+        shared = brick_widths(self._bricks, points, threads=self._threads, lane="query")
+        activation, weighted = (column.astype(np.float64) for column in shared)
+        if self.n_off_lattice:
+            columns = self._rest.columns.copy()
+            columns[1], columns[2] = rays.kernel_widths(self._rest) * columns[4], 0.0
+            more = kernel_index.latent_sums(
+                self._rest._replace(columns=columns), points, threads=self._threads, lane="query"
+            )
+            activation, weighted = activation + more.activation, weighted + more.mean
+        reached = activation > 0
+        return np.where(reached, weighted / np.where(reached, activation, 1.0), self.typical_width_m)
 
     def latent(self, points: Float64) -> LatentSums:
         """The bare sums of eq. 1 at (N, 3) points, with no rule for unobserved ones."""
+        sums = brick_sums(self._bricks, points, threads=self._threads, lane="query")
+        return _added(sums, self._rest_sums(points)) if self.n_off_lattice else sums
+
+    def _rest_sums(self, points: Float64) -> LatentSums:
         return kernel_index.latent_sums_of_parts(self._index, points, threads=self._threads, lane="query")
+
+
+def _added(one: LatentSums, other: LatentSums) -> LatentSums:
+    return LatentSums(*(a + b for a, b in zip(one, other, strict=True)))
 
 
 def as_points(points: ArrayLike) -> Float64:
@@ -216,7 +253,8 @@ def as_points(points: ArrayLike) -> Float64:
         raise BadPointsError("points have NaN or infinite coordinates")
     if array.shape[1] == 2:
         array = np.concatenate([array, np.zeros((len(array), 1))], axis=1)
-    return np.ascontiguousarray(array)
+    # a copy of arrays that were received: they are read-only, and loops are compiled for writable ones
+    return np.ascontiguousarray(array) if array.flags.writeable else np.array(array, order="C")
 
 
 def _float32(values: Float64) -> Float32:

@@ -14,9 +14,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from potserver.domain.kernel_map import IndexedKernels
+from potserver.domain.map_part import MapPart
 from potserver.domain.types import Bool, Float32, Float64, KernelSet
 from potserver.errors import SettingsError, ShapeError
+from potserver.numerics.bricks import Part
 from potserver.numerics.evidence import Rows, decay, is_alive, tile_of
 from potserver.numerics.threads import parallel_map
 from potserver.numerics.voxel_hash import CELL_LIMIT
@@ -25,7 +26,9 @@ TileIndex = tuple[int, int, int]  # floor(p_map / tile_size_m)
 
 COARSE, FINE, CARRIED = 0, 1, 2  # where a kernel of the overall map comes from: a lattice, or an atom
 COARSE_SPACING = 2.5  # of the coarse lattice, in resolutions
-_PART = 3  # tiles along an edge of what is indexed together: an index for each tile alone would cost more to build
+_PART = (
+    3  # tiles along an edge of what is put into bricks together: a window of nodes rarely crosses its border
+)
 _VOXELS_OF_PAIR = 5  # two coarse cells are five fine ones: the least length that every lattice divides
 
 
@@ -144,7 +147,7 @@ class TiledMap(NamedTuple):
 
     grid: TileGrid
     tiles: Mapping[TileIndex, Tile]
-    parts: Mapping[TileIndex, IndexedKernels]  # kernels of some tiles together, map frame, ready to be asked
+    parts: Mapping[TileIndex, MapPart]  # kernels of some tiles together, ready to be asked
     robots: tuple[str, ...] = ()  # whose the rows are: `Rows.source` numbers them
 
     @staticmethod
@@ -159,7 +162,7 @@ class TiledMap(NamedTuple):
         return self._replace(robots=(*self.robots, robot_id)), len(self.robots)
 
     def with_tiles(self, changed: Mapping[TileIndex, Tile], *, threads: int = 1) -> TiledMap:
-        """The map with some tiles exchanged, or gone if they are empty; only the parts that they lie in are indexed again."""
+        """The map with some tiles exchanged, or gone if they are empty; only the parts that they lie in are made anew."""
         tiles = dict(self.tiles)
         for index, tile in changed.items():
             if tile.is_empty:
@@ -167,18 +170,13 @@ class TiledMap(NamedTuple):
             else:
                 tiles[index] = tile
 
-        def indexed(number: TileIndex) -> IndexedKernels | None:
-            found = [index for index in tiles_of_part(number) if index in tiles]
-            if not found:
-                return None
-            members = [tiles[index].kernels.kernels for index in found]
-            shift = np.repeat(np.reshape(found, (-1, 3)), [len(m) for m in members], axis=0)
-            kernels = KernelSet.concatenate(members).moved(np.asarray(shift * self.grid.size_m, np.float64))
-            return IndexedKernels.of(kernels)
+        def ready(number: TileIndex) -> MapPart | None:
+            found = {index: tiles[index].kernels.kernels for index in tiles_of_part(number) if index in tiles}
+            return MapPart.of_tiles(found, Part(self.grid.size_m, _PART, number)) if found else None
 
         touched = list(dict.fromkeys(part_of(index) for index in changed))
         parts = dict(self.parts)
-        for number, part in zip(touched, parallel_map(indexed, touched, threads), strict=True):
+        for number, part in zip(touched, parallel_map(ready, touched, threads), strict=True):
             if part is None:
                 parts.pop(number, None)
             else:

@@ -31,12 +31,13 @@ inner_loop = nb.njit(
 )
 
 _f = np.float32
-_LOG2E, _MAGIC = _f(1.44269504088896), _f(12582912.0)
-_LN2_HIGH, _LN2_LOW = _f(0.693359375), _f(-2.12194440e-4)
+LOG2E, MAGIC = _f(1.44269504088896), _f(12582912.0)
+LN2_HIGH, LN2_LOW = _f(0.693359375), _f(-2.12194440e-4)
 _P0, _P1, _P2 = _f(1.9875691500e-4), _f(1.3981999507e-3), _f(8.3334519073e-3)
 _P3, _P4, _P5 = _f(4.1665795894e-2), _f(1.6666665459e-1), _f(5.0000001201e-1)
-_ONE, _ZERO, _LOWEST, _HIGHEST = _f(1), _f(0), _f(-87.0), _f(88.0)
-_BIAS, _MANTISSA_BITS, _MAGIC_BITS = np.int32(127), np.int32(23), np.int32(0x4B400000)
+POLYNOMIAL = (_P0, _P1, _P2, _P3, _P4, _P5)
+_ONE, _ZERO, LOWEST, _HIGHEST = _f(1), _f(0), _f(-87.0), _f(88.0)
+BIAS, MANTISSA_BITS, MAGIC_BITS = np.int32(127), np.int32(23), np.int32(0x4B400000)
 
 
 @intrinsic
@@ -58,11 +59,11 @@ def _bits_float(typing_context: Any, x: Any) -> Any:
 @nb.njit(fastmath={"contract"}, error_model="numpy", cache=True)
 def exp32(x: np.float32) -> np.float32:
     """exp(x) for float32; 0 at and below -87, exp(88) above 88."""
-    clipped = min(max(x, _LOWEST), _HIGHEST)
-    shifted = clipped * _LOG2E + _MAGIC
-    exponent = _float_bits(shifted) - _MAGIC_BITS
-    whole = shifted - _MAGIC
-    r = clipped - whole * _LN2_HIGH - whole * _LN2_LOW
+    clipped = min(max(x, LOWEST), _HIGHEST)
+    shifted = clipped * LOG2E + MAGIC
+    exponent = _float_bits(shifted) - MAGIC_BITS
+    whole = shifted - MAGIC
+    r = clipped - whole * LN2_HIGH - whole * LN2_LOW
     p = _P0
     p = p * r + _P1
     p = p * r + _P2
@@ -70,5 +71,5 @@ def exp32(x: np.float32) -> np.float32:
     p = p * r + _P4
     p = p * r + _P5
     y = p * r * r + r + _ONE
-    y = y * _bits_float((exponent + _BIAS) << _MANTISSA_BITS)
-    return y if x > _LOWEST else _ZERO
+    y = y * _bits_float((exponent + BIAS) << MANTISSA_BITS)
+    return y if x > LOWEST else _ZERO

@@ -23,6 +23,8 @@ import numpy as np
 
 from potschemas.answers import AnswerRule
 from potserver.numerics.arrays import Float64, Int64
+from potserver.numerics.brick_map import BrickMap, BrickTable
+from potserver.numerics.brick_sums import room_for_a_thread, sums_at
 from potserver.numerics.fastexp import exp32, inner_loop
 from potserver.numerics.gathering import kernels_that_reach
 from potserver.numerics.kernel_index import KernelIndex
@@ -32,6 +34,7 @@ _END_OF_RAY = 1e-7  # survival below which a ray ends: the share by which a mome
 # Length of the stretch of a ray that shares a list of kernels, in reaches of a kernel; measured.
 _BLOCK_REACHES = 3.0
 _BLOCK_STEPS = (4, 128)  # the least and the most steps of such a stretch
+_SMALL = 0.02  # below, series of the fifth degree are good to ten digits
 _WIDTH_OF_NOTHING_M = 1.0  # width in a map without kernels
 
 
@@ -63,19 +66,42 @@ class FirstReturns(NamedTuple):
     unknown_share: Float64  # (N,) of the ray's expected length, in unobserved space
 
 
+class Widths(NamedTuple):
+    """How wide kernels are: sqrt(pi / (2 gamma)), the integral of a squared kernel along a line through its hinge."""
+
+    width_m: Float64  # (W,)
+    n_kernels: Int64  # (W,) > 0, of each width
+
+    def quantile(self, share: float) -> float:
+        """Of all kernels; between two of them, in proportion."""
+        order = np.argsort(self.width_m)
+        ends = np.cumsum(self.n_kernels[order])
+        place = share * (ends[-1] - 1)
+        low, high = self.width_m[order][
+            np.searchsorted(ends, [math.floor(place), math.ceil(place)], side="right")
+        ]
+        return float(low + (place - math.floor(place)) * (high - low))
+
+
 def kernel_widths(index: KernelIndex) -> Float64:
-    """(K,) m, in the index's order: sqrt(pi / (2 gamma)), the integral of a squared kernel along a line through its hinge."""
+    """(K,) m, in the index's order: see `Widths`."""
     return np.sqrt(0.5 * math.pi / -index.columns[0].astype(np.float64))
 
 
-def typical_width(index: KernelIndex) -> float:
+def widths_of(index: KernelIndex, bricks: BrickMap) -> Widths:
+    """The widths of all kernels."""
+    own, (shared, count) = kernel_widths(index), bricks.widths
+    return Widths(np.concatenate([own, shared]), np.concatenate([np.ones(len(own), np.int64), count]))
+
+
+def typical_width(widths: Widths) -> float:
     """The median width of the kernels, m: what counts as one trial where there are none."""
-    return float(np.median(kernel_widths(index))) if len(index.hinge) else _WIDTH_OF_NOTHING_M
+    return widths.quantile(0.5) if len(widths.n_kernels) else _WIDTH_OF_NOTHING_M
 
 
-def fine_step(index: KernelIndex) -> float:
+def fine_step(widths: Widths) -> float:
     """A step, m, that resolves nearly all kernels: a third of the width that one kernel in twenty falls below."""
-    return (1.0 / 3.0) * float(np.quantile(kernel_widths(index), 0.05)) if len(index.hinge) else 1.0
+    return (1.0 / 3.0) * widths.quantile(0.05) if len(widths.n_kernels) else 1.0
 
 
 def count_steps(max_range_m: Float64, step_m: float) -> Int64:
@@ -84,14 +110,21 @@ def count_steps(max_range_m: Float64, step_m: float) -> Int64:
 
 
 def first_returns(
-    index: KernelIndex, rays: Rays, options: RayOptions, rule: AnswerRule, *, threads: int = 1
+    index: KernelIndex,
+    bricks: BrickMap,
+    rays: Rays,
+    options: RayOptions,
+    rule: AnswerRule,
+    *,
+    threads: int = 1,
 ) -> FirstReturns:
     """March rays by the midpoint rule, whose error falls with the square of the step.
 
-    Only the kernels that reach a stretch of a ray (see `kernel_index.reach`) are summed there.
+    Of the index, only the kernels that reach a stretch of a ray (see `kernel_index.reach`) are summed there.
 
     Args:
-        index: The kernels.
+        index: The kernels that stand on no lattice.
+        bricks: All others.
         rays: Where to look.
         options: How.
         rule: How sums over kernels become an occupancy.
@@ -106,6 +139,7 @@ def first_returns(
     widths = kernel_widths(index).astype(np.float32)
     block = int(np.clip(_BLOCK_REACHES * index.median_reach_m / options.step_m, *_BLOCK_STEPS))
     march = _March(
+        bricks=bricks.table,
         thresholds=-np.log1p(-np.asarray(options.quantiles, np.float64)),
         unknown_rate=float(options.unknown_rate),
         fixed_width_m=-1.0 if options.width_m is None else float(options.width_m),
@@ -115,15 +149,16 @@ def first_returns(
     )
 
     def run(span: tuple[int, int]) -> None:
-        _march(*span, rays, n_steps, block, march, index, widths, out, quantile_m)
+        _march(*span, rays, n_steps, block, march, index, widths, room_for_a_thread(), out, quantile_m)
 
     parallel_map(run, spans(n, 8 * threads if threads > 1 else 1), threads, "query")
     return FirstReturns(out[0], out[1], out[2], quantile_m, out[3], out[4])
 
 
 class _March(NamedTuple):
-    """What the compiled march needs to turn sums into ranges."""
+    """What the compiled march needs to sum, and to turn sums into ranges."""
 
+    bricks: BrickTable
     thresholds: Float64  # (Q,) hazard integrals at which the quantiles lie
     unknown_rate: float  # 1/m
     fixed_width_m: float  # negative: the kernels' own
@@ -143,7 +178,21 @@ def moderated(
 
 @nb.njit(error_model="numpy", cache=True)
 def _softplus(z: float) -> float:
-    return max(z, 0.0) + math.log1p(math.exp(-abs(z)))
+    e = math.exp(-abs(z))
+    # the series where it is as good: most of a ray is free, and the logarithm would take as long as a lattice
+    small = e * (1 - e * (1 / 2 - e * (1 / 3 - e * (1 / 4 - e * (1 / 5 - e / 6)))))
+    return max(z, 0.0) + (small if e < _SMALL else math.log1p(e))
+
+
+@nb.njit(error_model="numpy", cache=True)
+def _step(rate: float, h: float) -> tuple[float, float, float]:
+    """With q = rate h: 1 - exp(-q), and the integrals of exp(-rate t) and of t exp(-rate t) over t from 0 to h."""
+    q = rate * h
+    if q < _SMALL:  # the series, where the formulas would lose their digits
+        piece = h * (1 - q * (1 / 2 - q * (1 / 6 - q * (1 / 24 - q / 120))))
+        return rate * piece, piece, h * h * (1 / 2 - q * (1 / 3 - q * (1 / 8 - q * (1 / 30 - q / 144))))
+    stopped = -math.expm1(-q)
+    return stopped, stopped / rate, (stopped - q * (1.0 - stopped)) / (rate * rate)
 
 
 @inner_loop
@@ -163,7 +212,7 @@ def _sum_at(t, along, across2, minus_gamma, w, v, width, known, n):
 
 
 @nb.njit(nogil=True, error_model="numpy", cache=True)
-def _march(first, last, rays, n_steps, block, march, index, widths, out, quantile_m):
+def _march(first, last, rays, n_steps, block, march, index, widths, room, out, quantile_m):
     origins, directions, max_range_m = rays
     hinge, columns, thresholds = index.hinge, index.columns, march.thresholds
     found = np.empty(4096, np.int64)
@@ -179,8 +228,10 @@ def _march(first, last, rays, n_steps, block, march, index, widths, out, quantil
         unknown_range = np.nan
         k = 0  # the next quantile
         step = 0
+        n = 0
+        centre = 0.0
         while step < n_steps[i] and survival >= _END_OF_RAY:
-            if step % block == 0:
+            if step % block == 0 and len(hinge):
                 stop = min(step + block, n_steps[i])
                 half = 0.5 * (stop - step) * h
                 centre = step * h + half
@@ -213,10 +264,25 @@ def _march(first, last, rays, n_steps, block, march, index, widths, out, quantil
                         n += 1
             r = step * h
             step += 1
-            mean, var, activation, weighted = _sum_at(
-                np.float32(r + 0.5 * h - centre), local[0], local[1], local[2], local[3], local[4], local[5], local[6], n,
-            )  # fmt: skip
-            if n > 0 and activation >= march.observed_activation:
+            mean, var, activation, weighted = sums_at(
+                march.bricks,
+                origins[i, 0] + (r + 0.5 * h) * directions[i, 0],
+                origins[i, 1] + (r + 0.5 * h) * directions[i, 1],
+                origins[i, 2] + (r + 0.5 * h) * directions[i, 2],
+                room.ctypes.data,
+            )
+            if n > 0:
+                more = _sum_at(
+                    np.float32(r + 0.5 * h - centre), local[0], local[1], local[2], local[3], local[4], local[5], local[6],
+                    n,
+                )  # fmt: skip
+                mean, var, activation, weighted = (
+                    mean + more[0],
+                    var + more[1],
+                    activation + more[2],
+                    weighted + more[3],
+                )
+            if activation > 0.0 and activation >= march.observed_activation:
                 is_known = True
                 width = march.fixed_width_m if march.fixed_width_m > 0 else weighted / activation
                 z = moderated(mean, var, activation, march.residual_var, march.mean_moderation)
@@ -237,19 +303,13 @@ def _march(first, last, rays, n_steps, block, march, index, widths, out, quantil
             while k < len(thresholds) and hazard + passed >= thresholds[k]:
                 quantile_m[i, k] = r + (thresholds[k] - hazard) / rate
                 k += 1
-            if passed > 1e-4:
-                stopped = -math.expm1(-passed)
-                piece = stopped / rate
-                inner = (stopped - passed * (1.0 - stopped)) / (rate * rate)
-            else:  # the series, where the formula would lose its digits
-                piece = h * (1.0 - 0.5 * passed)
-                inner = h * h * (0.5 - passed / 3.0)
+            stopped, piece, inner = _step(rate, h)
             length += survival * piece
             moment += survival * (r * piece + inner)
             if not is_known:
                 unknown_length += survival * piece
             hazard += passed
-            survival = math.exp(-hazard)
+            survival *= 1.0 - stopped
         while k < len(thresholds):
             quantile_m[i, k] = max_range_m[i]
             k += 1

@@ -22,6 +22,7 @@ from potserver.adapters.questions.control import VERBS, work_of
 from potserver.adapters.questions.question import Asked, Served
 from potserver.adapters.questions.registry import QUESTIONS
 from potserver.adapters.questions.tiles import decode_tiles
+from potserver.asking.grid import Grid
 from potserver.asking.params import Params
 from potserver.asking.points import Points
 from potserver.asking.rays import Rays
@@ -33,13 +34,15 @@ from potserver.codec.base import decode
 from potserver.domain.dictionary import AtomDictionary
 from potserver.domain.kernel_map import KernelMap
 from potserver.domain.map_state import MapState
-from potserver.domain.types import Atom, Unknown
+from potserver.domain.tiles import COARSE, MapKernels, Tile, TiledMap
+from potserver.domain.types import Atom, KernelSet, Unknown
 from potserver.errors import PotserverError
 from potserver.health import Health
 from potserver.limits import Limits
 from potserver.mapping.service import MappingService
-from potserver.numerics import gradients, lattice, rays
-from tests.tiled_maps import free_kernels, tiled_state
+from potserver.numerics import brick_grid, brick_sums, cubes, gradients, kernel_index, lattice, rays
+from potserver.numerics.evidence import Rows
+from tests.tiled_maps import GRID, free_kernels, lattice_kernels, tiled_state
 
 LIMITS = Limits(max_query_points=50, max_coordinate_m=1000.0)
 
@@ -300,12 +303,26 @@ def test_verbs_take_their_fields_and_no_others(verb: str, fields: dict[str, Any]
 def test_whatever_is_asked_needs_no_other_compilation_than_the_warm_up() -> None:
     """A first question that compiles would take seconds; received arrays are read-only, and options may be integers."""
     registry.warm_up()
-    kernels, limits = KernelMap(free_kernels(300), threads=1), Limits()
+    limits = Limits()
+    tiles = {(x, 0, 0): KernelSet.concatenate([lattice_kernels(400), free_kernels(300)]) for x in (0, 9)}
+    made = {index: Tile(Rows.empty(), MapKernels.new(own, COARSE)) for index, own in tiles.items()}
+    kernels = KernelMap(list(TiledMap.empty(GRID).with_tiles(made).parts.values()), threads=1)
     received = np.frombuffer(np.ones(6).tobytes()).reshape(2, 3)
     asked = Rays(received, received.astype(np.float32), 5, unknown=Unknown.OCCUPIED, width_m=1)
     asked.plan(kernels, limits).part(0)
     pose = np.frombuffer(np.eye(4).tobytes()).reshape(1, 4, 4)
     Risk(pose, np.array([[0, 0, 0, 1], [1, 0, 0, 2]]), dims=2, resolution_m=1).plan(kernels, limits).part(0)
     Points(received, with_gradient=True).plan(kernels, limits).part(0)
-    for compiled in (rays._march, lattice._cover, gradients._gradient_cubes):
+    Grid(received[0], received[0] + 3.0, 1).plan(kernels, limits).part(0)
+    for compiled in (
+        rays._march,
+        lattice._cover,
+        gradients._gradient_cubes,
+        kernel_index._sum_cubes,
+        brick_sums._sum_points,
+        brick_sums._slope_points,
+        brick_grid._sum_columns,
+        brick_grid._taps,
+        cubes._counting_sort,
+    ):
         assert len(compiled.signatures) == 1

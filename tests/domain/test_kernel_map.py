@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from potschemas.answers import OBSERVED_ACTIVATION, PRIOR_VAR, AnswerRule
-from potserver.domain.kernel_map import IndexedKernels, KernelMap, as_points
+from potserver.domain.kernel_map import KernelMap, as_points
+from potserver.domain.map_part import MapPart
 from potserver.domain.types import KernelSet
 from potserver.errors import BadPointsError, ShapeError
 
@@ -153,7 +154,7 @@ def test_parts_answer_like_the_whole() -> None:
         rng.uniform(0, 2, 4000),
     )
     part_of = np.floor(whole.kernels.hinge_mean[:, 0] / 25.0).astype(int)
-    parts = [IndexedKernels.of(whole.kernels.take(part_of == n)) for n in (*np.unique(part_of), 99)]
+    parts = [MapPart.of(whole.kernels.take(part_of == n)) for n in (*np.unique(part_of), 99)]
     together = KernelMap(parts, map_revision=3, threads=2)
     points = np.concatenate([rng.uniform(-70, 70, (5000, 3)) * [1, 1, 0.1], whole.kernels.hinge_mean[:500]])
     one, other = whole.occupancy(points), together.occupancy(points)

@@ -238,6 +238,9 @@ class FakeSnapshot:
             map_revision=self.map_revision,
         )
 
+    def occupancy_of_cells(self, _cells: Any, first: int, last: int) -> Occupancy:
+        return self.occupancy(np.zeros((last - first, 3)))
+
 
 class Gate:
     """Where a test can hold the threads of a server."""

@@ -13,6 +13,7 @@ import pytest
 
 from potserver.domain.types import AnswerRule
 from potserver.numerics.abhm import loops
+from potserver.numerics.brick_map import BrickMap
 from potserver.numerics.coupling import CouplingCosts, Ragged, couple, coupling_costs
 from potserver.numerics.feature_blocks import (
     Blocks,
@@ -75,7 +76,10 @@ def test_rays() -> None:
     options = RayOptions(step_m=0.1, quantiles=np.array([0.1, 0.5]), unknown_rate=0.3, width_m=None)
     rule = AnswerRule(0.05, 100.0, 1.0, 0.5)
     _same(
-        [first_returns(_all_placed(index, o), _all_placed(rays, o), options, rule) for o in OFFSETS],
+        [
+            first_returns(_all_placed(index, o), BrickMap([]), _all_placed(rays, o), options, rule)
+            for o in OFFSETS
+        ],
     )
 
 

@@ -9,6 +9,8 @@ from potserver.adapters.questions.question import Asked, Question
 from potserver.asking.grid import Grid, GridPlan, GridRun
 from potserver.codec.base import MAX_SMALL_BYTES
 from potserver.codec.occupancy import encode_occupancy
+from potserver.domain.kernel_map import KernelMap
+from potserver.limits import Limits
 
 
 def _answer(asked: Asked, query: messages.GridQuery) -> Iterator[messages.Message]:
@@ -30,4 +32,10 @@ def encode_part(plan: GridPlan, number: int, run: GridRun) -> messages.GridPart:
     )
 
 
-QUESTION = Question(op="grid", query=messages.GridQuery, answer=_answer, max_bytes=MAX_SMALL_BYTES)
+def _warm_up(kernels: KernelMap) -> None:
+    Grid([0.0, 0.0, 0.0], [1.0, 1.0, 1.0], 0.5).plan(kernels, Limits()).part(0)
+
+
+QUESTION = Question(
+    op="grid", query=messages.GridQuery, answer=_answer, max_bytes=MAX_SMALL_BYTES, warm_up=_warm_up
+)
