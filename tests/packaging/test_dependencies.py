@@ -90,8 +90,10 @@ def test_the_server_imports_only_what_it_declares(root: Path, project: dict) -> 
 
 
 def test_the_client_needs_nothing_that_the_server_does_not(project: dict, client_project: dict) -> None:
-    theirs = {str(requirement) for requirement in requirements(client_project, "files", "towns", "view")}
-    assert theirs <= {str(requirement) for requirement in requirements(project)}
+    for extra in client_project["optional-dependencies"]:
+        theirs = {str(requirement) for requirement in requirements(client_project, extra)}
+        ours = [extra] if extra in project["optional-dependencies"] else []
+        assert theirs <= {str(requirement) for requirement in requirements(project, *ours)}, extra
 
 
 @pytest.mark.parametrize("python", PYTHONS)
