@@ -1,4 +1,4 @@
-"""`potclient publish | query | grid | rays | risk | export | mirror | watch | load | info | atoms | map | town`."""
+"""`potclient publish | query | grid | rays | risk | export | mirror | watch | view | load | info | atoms | map | town`."""
 
 from __future__ import annotations
 
@@ -20,6 +20,7 @@ from potclient.commands import (
     rays,
     risk,
     town,
+    view,
     watch,
 )
 from potclient.commands.parsers import CommandParser
@@ -28,7 +29,7 @@ from potclient.errors import DatasetError, MapServerError, PotclientError, Usage
 from potclient.zenoh_config import DEFAULT_ENDPOINT
 from potschemas import __version__
 
-_VERBS = (publish, query, grid, rays, risk, export, mirror, watch, load, info, atoms, map, town)
+_VERBS = (publish, query, grid, rays, risk, export, mirror, watch, view, load, info, atoms, map, town)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

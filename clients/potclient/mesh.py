@@ -19,7 +19,6 @@ _LEVEL = 0.5
 _LARGEST_SD = 0.5  # of a probability
 # From sure to unsure, as matplotlib's viridis goes.
 _COLOURS = np.array([[68, 1, 84], [59, 82, 139], [33, 145, 140], [94, 201, 98], [253, 231, 37]], np.float64)
-_MESH_ENDINGS = {"mesh": ".ply", "gltf": ".glb"}
 
 
 class Mesh(NamedTuple):
@@ -105,10 +104,9 @@ def export_mesh(
     Returns:
         How many triangles, and the revisions that they are of.
     Raises:
-        UsageError: another ending than the kind's, no surface in the box, or a package is missing.
+        UsageError: no surface in the box, or a package is missing.
         PotclientError: see `MapClient.grid`; nothing is written then.
     """
-    check_mesh_ending(kind, path)
     try:
         import trimesh
     except ImportError as error:
@@ -125,18 +123,8 @@ def export_mesh(
     if kind == "gltf":
         written.apply_transform(_Y_UP)
     with whole(path) as file:
-        file.write(written.export(file_type=path.suffix[1:]))
+        file.write(written.export(file_type="glb" if kind == "gltf" else "ply"))
     return len(written.faces), tuple(sorted(revisions))
-
-
-def check_mesh_ending(kind: str, path: Path) -> None:
-    """Refuse a name that says another format.
-
-    Raises:
-        UsageError: it does.
-    """
-    if path.suffix != _MESH_ENDINGS[kind]:
-        raise UsageError(f"{path}: export {kind} writes {_MESH_ENDINGS[kind]}")
 
 
 _Y_UP: Float64 = np.array([[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]], np.float64)

@@ -14,7 +14,7 @@ def add(commands: Any) -> None:
         commands,
         "export",
         run,
-        help="the map as a file of another program: ply, npz, pgm, bt, mesh, gltf",
+        help="the map as a file of another program: ply, npz, pgm, bt, mesh, gltf, rrd",
         description="""Write the map as a file that other programs read. Maps larger than one answer are fetched part by part.
 
   ply   kernels, all ten numbers of each, coloured by what they say
@@ -23,6 +23,7 @@ def add(commands: Any) -> None:
   bt    occupancy as a binary OctoMap: observed cells only
   mesh  the surface where the probability is one half, as a PLY of triangles coloured by its standard deviation
   gltf  the same as binary glTF (.glb), whose y axis is up
+  rrd   the surface, free space and the edge of the unknown as a recording of Rerun; `potclient view` follows a map
 
 For pgm, --above-ground says which heights above the ground matter to the robot, and --band which heights of the map frame.
 A planar map is one layer and needs neither.""",

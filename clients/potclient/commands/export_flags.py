@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 from collections.abc import Sequence
 
 import numpy as np
@@ -14,9 +15,9 @@ from potclient.commands.output_files import output_file
 from potclient.commands.shared import EXIT_OK, add_box_arguments, note, part_bar, positive, say
 from potclient.errors import UsageError
 from potclient.ground import estimate_ground
-from potclient.mesh import check_mesh_ending, export_mesh
+from potclient.mesh import export_mesh
 
-EXPORT_KINDS = ("ply", "npz", "pgm", "bt", "mesh", "gltf")
+EXPORT_KINDS = ("ply", "npz", "pgm", "bt", "mesh", "gltf", "rrd")
 _WHAT = {
     "ply": "kernels",
     "npz": "kernels",
@@ -24,8 +25,10 @@ _WHAT = {
     "bt": "voxels",
     "mesh": "triangles",
     "gltf": "triangles",
+    "rrd": "tiles",
 }
-_GRID_KINDS = ("pgm", "bt", "mesh", "gltf")
+_ENDINGS = {"mesh": ".ply", "gltf": ".glb", "rrd": ".rrd"}
+_GRID_KINDS = ("pgm", "bt", "mesh", "gltf", "rrd")
 _TOUCHES_M, _TOUCHES_SHARE = (
     0.1,
     0.05,
@@ -37,7 +40,7 @@ def add_export_flags(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("-o", "--out", type=output_file, required=True, metavar="FILE", help="file to write")
     add_box_arguments(parser, "corner of the box (default: the map's)")
     parser.add_argument(
-        "--resolution", type=positive, metavar="METRES", help="pgm, bt, mesh, gltf: cell edge"
+        "--resolution", type=positive, metavar="METRES", help="of cells; all but ply and npz have them"
     )
     heights = parser.add_mutually_exclusive_group()
     heights.add_argument(
@@ -75,12 +78,15 @@ def check_export_flags(arguments: argparse.Namespace) -> None:
         raise UsageError(
             f"export {kind}: --band and --above-ground are for pgm; give the heights with --lower and --upper"
         )
-    if kind in ("mesh", "gltf"):
+    if kind in ("mesh", "gltf", "rrd"):
         if any(flag is not None for flag in thresholds):
             raise UsageError(
                 f"export {kind}: the surface is where p is one half; leave out --occupied and --free"
             )
-        check_mesh_ending(kind, arguments.out)
+        if arguments.out.suffix != _ENDINGS[kind]:
+            raise UsageError(f"{arguments.out}: export {kind} writes {_ENDINGS[kind]}")
+    if kind == "rrd" and (arguments.lower is not None or arguments.upper is not None):
+        raise UsageError("export rrd: it draws whole tiles; leave out --lower and --upper")
     for name, band in (("--band", arguments.band), ("--above-ground", arguments.above_ground)):
         if band is not None and not band[0] < band[1]:
             raise UsageError(f"export pgm: {name} {band[0]:g} {band[1]:g}: need LOW below HIGH")
@@ -97,6 +103,8 @@ def export_map(source: MapSource, arguments: argparse.Namespace) -> int:
         elif arguments.kind in ("mesh", "gltf"):
             box = CellBox.around(*_corners(source, arguments), arguments.resolution)
             done = export.Exported(*export_mesh(source, arguments.out, box, arguments.kind, progress))
+        elif arguments.kind == "rrd":
+            done = _export_rrd(source, arguments, progress)
         else:
             write = export.export_ply if arguments.kind == "ply" else export.export_npz
             done = write(
@@ -109,6 +117,24 @@ def export_map(source: MapSource, arguments: argparse.Namespace) -> int:
     if len(done.revisions) > 1:
         note(f"the map changed meanwhile: revisions {done.revisions[0]} to {done.revisions[-1]}")
     return EXIT_OK
+
+
+def _export_rrd(
+    source: MapSource, arguments: argparse.Namespace, progress: Progress | None
+) -> export.Exported:
+    from potclient.view.live import draw_map
+    from potclient.view.picture import MapPicture
+
+    bounds_of(source)  # refuses an empty map before there is a file
+    revision, partial = source.info().map_revision, arguments.out.with_name(arguments.out.name + ".partial")
+    try:
+        with contextlib.closing(MapPicture(f"map {source.info().map}")) as picture:
+            picture.save(partial)
+            n_tiles = draw_map(source, picture, arguments.resolution, progress)
+        partial.replace(arguments.out)
+    finally:
+        partial.unlink(missing_ok=True)
+    return export.Exported(n_tiles, tuple(sorted({revision, source.info().map_revision})))
 
 
 def _export_pgm(
