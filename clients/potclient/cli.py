@@ -23,6 +23,7 @@ from potclient.commands import (
     view,
     watch,
 )
+from potclient.commands.completion import add_completion_flag
 from potclient.commands.parsers import CommandParser
 from potclient.commands.shared import EXIT_FAILED, EXIT_INTERRUPTED, EXIT_USAGE, complain
 from potclient.errors import DatasetError, MapServerError, PotclientError, UsageError
@@ -74,6 +75,7 @@ def build_parser() -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--version", action="version", version=f"potclient {__version__}")
+    add_completion_flag(parser)
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
     for verb in _VERBS:
         verb.add(commands)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -16,7 +17,8 @@ from potclient.poses import between, quaternion_of, quaternion_pose
 # Looked for in this order. Others are named to the reader of an error or a note.
 POSE_FILES = ("poses.txt", "poses.tum", "trajectory.tum", "graph.txt")
 _MAX_GAP_S = 1.0  # between poses: what a robot did in a longer one, nobody knows
-_MAX_BYTES = 100 << 20
+_TEXTS = (".txt", ".tum", ".csv", ".g2o", ".graph")
+_MAX_BYTES, _MAX_TEXTS = 100 << 20, 50  # beyond these, files are not looked into for poses
 _VERTEX_WORDS = ("v", "VERTEX_SE3:QUAT")
 
 
@@ -106,9 +108,9 @@ def find_poses(folder: Path, named: str | Path | None) -> Path | None:
 def other_poses(folder: Path, taken: Path | None = None) -> list[tuple[str, Trajectory]]:
     """Names and contents of the files in a folder that hold poses, but for the one that is taken."""
     found = []
-    for path in sorted(folder.iterdir(), key=natural_key):
-        is_text = path.suffix.lower() in (".txt", ".tum", ".csv", ".g2o", ".graph")
-        if path != taken and is_text and path.is_file() and path.stat().st_size < _MAX_BYTES:
+    texts = (path for path in sorted(folder.iterdir(), key=natural_key) if path.suffix.lower() in _TEXTS)
+    for path in itertools.islice(texts, _MAX_TEXTS):
+        if path != taken and path.is_file() and path.stat().st_size < _MAX_BYTES:
             try:
                 found.append((path.name, read_trajectory(path)))
             except DatasetError:
