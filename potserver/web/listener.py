@@ -1,0 +1,73 @@
+"""The HTTP server, on a thread of its own."""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+from collections.abc import Callable
+
+from potschemas import messages
+from potserver.errors import SettingsError
+from potserver.log import get_logger
+from potserver.threads import spawn
+
+log = get_logger("potserver.web")
+
+_STOP_S = 5.0
+
+
+class WebListener:
+    """Serves the pages of `make_app` from its making until `close`.
+
+    Args:
+        address: HOST:PORT; port 0 takes a free one.
+        state: See `make_app`.
+        stats: See `make_app`.
+    Raises:
+        SettingsError: no such address, it is taken, or the packages of the extra `web` are missing.
+    """
+
+    def __init__(self, address: str, state: Callable[[], str], stats: Callable[[], messages.Stats]) -> None:
+        try:
+            import uvicorn
+
+            from potserver.web.app import make_app
+        except ImportError as error:
+            raise SettingsError(
+                f"web.listen needs the packages of the extra `web`: pip install 'potserver[web]' ({error})"
+            ) from error
+        host, port = host_and_port(address)
+        try:
+            family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0][0]
+            self._socket = socket.create_server((host, port), family=family)
+        except OSError as error:
+            raise SettingsError(f"web.listen = {address!r}: {error.strerror or error}") from error
+        found = self._socket.getsockname()
+        self.address = f"[{found[0]}]:{found[1]}" if ":" in found[0] else f"{found[0]}:{found[1]}"
+        config = uvicorn.Config(make_app(state, stats), log_config=None, access_log=False, lifespan="off")
+        self._server = uvicorn.Server(config)
+        self._thread = spawn("web", self._run)
+        log.info("web_listening", address=self.address)
+
+    def close(self) -> bool:
+        """Answer no more; whether everything ended in time."""
+        self._server.should_exit = True
+        self._thread.join(_STOP_S)
+        with contextlib.suppress(OSError):
+            self._socket.close()
+        return not self._thread.is_alive()
+
+    def _run(self) -> None:
+        self._server.run(sockets=[self._socket])
+
+
+def host_and_port(address: str) -> tuple[str, int]:
+    """The parts of HOST:PORT; an IPv6 host stands in brackets.
+
+    Raises:
+        SettingsError: not of that form.
+    """
+    host, found, port = address.rpartition(":")
+    if not (found and host and port.isascii() and port.isdigit() and int(port) < 2**16):
+        raise SettingsError(f"web.listen = {address!r}: need HOST:PORT, e.g. 127.0.0.1:8080")
+    return host.removeprefix("[").removesuffix("]"), int(port)
