@@ -83,10 +83,10 @@ class StoreSettings:
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class WebSettings:
-    """What operators are told over HTTP: `/live`, `/ready` and `/metrics` for Prometheus."""
+    """What is told over HTTP: a page with the map, `/live`, `/ready` and `/metrics` for Prometheus."""
 
     listen: Annotated[
-        str | None, "HOST:PORT; unset: nothing is told. Whoever reaches it may read the counters"
+        str | None, "HOST:PORT; unset: nothing is told. Whoever reaches it may read the maps"
     ] = None
 
 

@@ -34,7 +34,7 @@ from potserver.mapping.service import MappingService
 from potserver.node import FLUSH_S, QUEUE_MESSAGES, MapNode, Shared
 from potserver.numerics.threads import default_threads
 from potserver.storage.map_store import MapStore, MemoryOnly
-from potserver.web.listener import WebListener
+from potserver.web.listener import Served, WebListener
 
 log = get_logger("potserver.server")
 
@@ -98,7 +98,7 @@ class MapServer:
             log.info("server_starting", version=__version__)
             log.debug("settings_in_use", settings=as_tree(s))
             if s.web.listen is not None:  # first: who asks whether we are ready hears "starting" until we are
-                self.web = WebListener(s.web.listen, lambda: self.state, self.stats)
+                self.web = WebListener(s.web.listen, self._served())
             try:
                 self._start(s)
             except BaseException:
@@ -244,6 +244,14 @@ class MapServer:
         stores, self._stores = self._stores, {}
         closed = [store.close() for store in stores.values()]  # all of them, whatever the first says
         return all(closed)
+
+    def _served(self) -> Served:
+        """What is told over HTTP."""
+
+        def endpoint() -> str | None:
+            return self._endpoints[0] if self._endpoints and self.state == "serving" else None
+
+        return Served(lambda: self.state, self.stats, endpoint, self.settings.maps, self.settings.root)
 
     def _close_web(self) -> bool:
         return self.web is None or self.web.close()

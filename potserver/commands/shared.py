@@ -122,7 +122,9 @@ def add_settings_flags(parser: argparse.ArgumentParser) -> None:
         "--in-memory", action="store_const", dest="store", const="", help="forget the maps at the end"
     )
     server.add_argument(
-        "--web", metavar="HOST:PORT", help="tell /live, /ready and /metrics (Prometheus) there over HTTP"
+        "--web",
+        metavar="HOST:PORT",
+        help="serve a page with the map there, /live, /ready and /metrics (Prometheus)",
     )
     server.add_argument(
         "--drain-timeout", type=float, metavar="S", help="seconds for waiting clouds at SIGTERM [10]"

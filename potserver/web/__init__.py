@@ -1,1 +1,1 @@
-"""What a server tells over HTTP, for those who operate it: is it alive, is it ready, and its counters for Prometheus."""
+"""What a server tells over HTTP: a page with its maps, is it alive, is it ready, and its counters for Prometheus."""

@@ -1,4 +1,4 @@
-"""The pages: /live, /ready and /metrics."""
+"""All addresses: /live, /ready and /metrics for operators, and the page with the map."""
 
 from __future__ import annotations
 
@@ -11,13 +11,15 @@ from starlette.routing import Route
 
 from potschemas import messages
 from potserver.web.metrics import CONTENT_TYPE, exposition
+from potserver.web.pages import Pages
 
 
-def make_app(state: Callable[[], str], stats: Callable[[], messages.Stats]) -> Starlette:
+def make_app(state: Callable[[], str], pages: Pages, stats: Callable[[], messages.Stats]) -> Starlette:
     """The application.
 
     Args:
         state: "serving", or what the server does instead.
+        pages: With the map.
         stats: The counters now.
     """
     metrics = exposition(stats)
@@ -35,4 +37,5 @@ def make_app(state: Callable[[], str], stats: Callable[[], messages.Stats]) -> S
         return Response(metrics(), media_type=CONTENT_TYPE)
 
     # plain functions: starlette runs them on threads, so that a slow scrape holds up nobody
-    return Starlette(routes=[Route("/live", live), Route("/ready", ready), Route("/metrics", scrape)])
+    operators = [Route("/live", live), Route("/ready", ready), Route("/metrics", scrape)]
+    return Starlette(routes=[*operators, *pages.routes()])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import socket
 from collections.abc import Callable
+from typing import NamedTuple
 
 from potschemas import messages
 from potserver.errors import SettingsError
@@ -16,22 +17,32 @@ log = get_logger("potserver.web")
 _STOP_S = 5.0
 
 
+class Served(NamedTuple):
+    """What HTTP needs to know of the server."""
+
+    state: Callable[[], str]  # "serving", or what it does instead
+    stats: Callable[[], messages.Stats]
+    endpoint: Callable[[], str | None]  # where the page's own client connects; None while nobody can
+    maps: tuple[str, ...]
+    root: str
+
+
 class WebListener:
-    """Serves the pages of `make_app` from its making until `close`.
+    """Serves the addresses of `make_app` from its making until `close`.
 
     Args:
         address: HOST:PORT; port 0 takes a free one.
-        state: See `make_app`.
-        stats: See `make_app`.
+        served: The server.
     Raises:
         SettingsError: no such address, it is taken, or the packages of the extra `web` are missing.
     """
 
-    def __init__(self, address: str, state: Callable[[], str], stats: Callable[[], messages.Stats]) -> None:
+    def __init__(self, address: str, served: Served) -> None:
         try:
             import uvicorn
 
             from potserver.web.app import make_app
+            from potserver.web.pages import Pages
         except ImportError as error:
             raise SettingsError(
                 f"web.listen needs the packages of the extra `web`: pip install 'potserver[web]' ({error})"
@@ -44,7 +55,9 @@ class WebListener:
             raise SettingsError(f"web.listen = {address!r}: {error.strerror or error}") from error
         found = self._socket.getsockname()
         self.address = f"[{found[0]}]:{found[1]}" if ":" in found[0] else f"{found[0]}:{found[1]}"
-        config = uvicorn.Config(make_app(state, stats), log_config=None, access_log=False, lifespan="off")
+        self._pages = Pages(served)
+        app = make_app(served.state, self._pages, served.stats)
+        config = uvicorn.Config(app, log_config=None, access_log=False, lifespan="off")
         self._server = uvicorn.Server(config)
         self._thread = spawn("web", self._run)
         log.info("web_listening", address=self.address)
@@ -53,6 +66,7 @@ class WebListener:
         """Answer no more; whether everything ended in time."""
         self._server.should_exit = True
         self._thread.join(_STOP_S)
+        self._pages.close()
         with contextlib.suppress(OSError):
             self._socket.close()
         return not self._thread.is_alive()

@@ -18,7 +18,7 @@ from potserver.config import load_settings
 from potserver.errors import SettingsError
 from potserver.mapping.service import MappingService
 from potserver.server import MapServer
-from potserver.web.listener import WebListener, host_and_port
+from potserver.web.listener import Served, WebListener, host_and_port
 
 from .conftest import DEADLINE_S
 from .rooms import pose, room
@@ -88,7 +88,7 @@ def test_only_these_pages_are_there(served: MapServer) -> None:
     assert served.web is not None
     assert fetch(served.web.address, "/live") == (200, "live\n")
     assert fetch(served.web.address, "/ready") == (200, "serving\n")
-    assert fetch(served.web.address, "/")[0] == 404
+    assert fetch(served.web.address, "/nothing")[0] == 404
 
 
 def test_ready_says_starting_and_draining_while_live_says_live() -> None:
@@ -145,4 +145,6 @@ def test_a_taken_port_is_said() -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         address = f"127.0.0.1:{taken.getsockname()[1]}"
         with pytest.raises(SettingsError, match=r"web\.listen.*in use"):
-            WebListener(address, lambda: "serving", lambda: None)  # type: ignore[arg-type,return-value]
+            WebListener(
+                address, Served(lambda: "serving", lambda: None, lambda: None, ("default",), "pot/v1")
+            )  # type: ignore[arg-type,return-value]
