@@ -21,6 +21,7 @@ RESOLUTION_M = 0.25
 MAX_SLICE_CELLS = 1_000_000
 _MAX_TILES = 4096  # that are kept as meshes
 _READY_S = 5.0
+_MAX_POSES, _STEP_SHARE = 1000, 0.5  # of a way, and of the ball's radius from one to the next
 
 
 class MapFeed:
@@ -135,6 +136,20 @@ class MapFeed:
             "sd_m": float(answer.std_m[0]),
             "reach_m": reach,
             "unknown_share": float(answer.unknown_share[0]),
+        }
+
+    def risk(self, start: list[float], end: list[float], radius_m: float) -> dict[str, Any]:
+        """How likely a ball touches something on the straight way from one point (3,) m to another."""
+        length = float(np.linalg.norm(np.asarray(end) - np.asarray(start)))
+        n_poses = min(_MAX_POSES, 2 + int(length / (_STEP_SHARE * radius_m)))
+        way = np.tile(np.eye(4), (n_poses, 1, 1))
+        way[:, :3, 3] = np.linspace(start, end, n_poses)
+        answer = self.client.risk(way, [[0.0, 0.0, 0.0, radius_m]], unknown="prior")
+        return {
+            "max": answer.path_max_probability,
+            "union": answer.path_union_probability,
+            "unknown_share": answer.path_unknown_share,
+            "length_m": length,
         }
 
     def _layer(self) -> float | None:

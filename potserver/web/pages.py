@@ -40,6 +40,7 @@ class Pages:
             "slice": self._slice,
             "point": self._point,
             "ray": self._ray,
+            "risk": self._risk,
         }
         return [
             Route("/", lambda request: _file("index.html")),
@@ -88,6 +89,13 @@ class Pages:
     def _ray(self, request: Request) -> Response:
         ends = _numbers(request, "x", "y", "z", "tx", "ty", "tz")
         return JSONResponse(self._feed(request).ray(ends[:3], ends[3:]))
+
+    def _risk(self, request: Request) -> Response:
+        ends = _numbers(request, "x", "y", "z", "tx", "ty", "tz")
+        (radius_m,) = _numbers(request, "radius")
+        if not 0.05 <= radius_m <= 5.0:
+            raise ValueError("radius must be 0.05 to 5 m")
+        return JSONResponse(self._feed(request).risk(ends[:3], ends[3:], radius_m))
 
 
 def _answered(answer: Callable[[Request], Response]) -> Callable[[Request], Response]:

@@ -82,6 +82,18 @@ def test_points_and_rays_are_what_a_client_is_told(served: MapServer, client: Ma
     assert answer["reach_m"] == 9.0
 
 
+def test_risk_of_a_straight_way(served: MapServer, client: MapClient) -> None:
+    free = ask(served, "risk", x=0, y=0, z=0, tx=3, ty=0, tz=0, radius=0.3)
+    through = ask(served, "risk", x=0, y=0, z=0, tx=8, ty=0, tz=0, radius=0.3)
+    assert free["length_m"] == 3.0
+    assert free["union"] < 0.1 < 0.9 < through["union"]
+    way = np.tile(np.eye(4), (22, 1, 1))
+    way[:, 0, 3] = np.linspace(0, 3, 22)
+    expected = client.risk(way, [[0, 0, 0, 0.3]], unknown="prior")
+    assert free["union"] == pytest.approx(expected.path_union_probability, abs=1e-6)
+    assert refused(served, "risk", x=0, y=0, z=0, tx=3, ty=0, tz=0, radius=0)[0] == 400
+
+
 def test_a_tile_is_the_surface_in_it(served: MapServer, client: MapClient) -> None:
     tiles = ask(served, "state")["tiles"]
     n_faces = 0
