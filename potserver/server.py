@@ -3,8 +3,8 @@
     with MapServer(Settings(), listen="tcp/127.0.0.1:0") as server:
         client = MapClient(server.endpoint)
 
-Threads, besides Zenoh's own and those of `MapNode`: the query workers, the stats publisher and its queryable, and one a
-store for snapshots.
+Threads, besides Zenoh's own and those of `MapNode`: the query workers, the stats publisher and its queryable, one a
+store for snapshots, and, with `web.listen`, those of HTTP.
 """
 
 from __future__ import annotations

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import html
 import json
-import re
-import shutil
-import subprocess
 import urllib.error
 import urllib.parse
 import urllib.request
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,11 +18,11 @@ from potclient.mesh import mesh_of
 from potserver.config import load_settings
 from potserver.server import MapServer
 
+from .browser import Browser, find_browser
 from .conftest import DEADLINE_S, until
 from .rooms import pose, room
 
 pytest.importorskip("starlette")
-BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 
 
 @pytest.fixture(scope="module")
@@ -157,22 +154,35 @@ def test_what_is_wrong_is_said(served: MapServer, client: MapClient) -> None:
     assert refused(served, "point", x=1e9, y=0, z=0)[0] == 503, "the server refuses it"
 
 
-def test_a_browser_draws_the_map_and_asks_it(served: MapServer, client: MapClient) -> None:
-    browser = next(filter(None, map(shutil.which, BROWSERS)), None)
-    if browser is None:
+def test_a_browser_draws_the_map_and_a_click_asks_it(
+    served: MapServer, client: MapClient, tmp_path: Path
+) -> None:
+    program = find_browser()
+    if program is None:
         pytest.skip("no chromium here")
     assert served.web is not None
-    words = ["--headless=new", "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
-    words += ["--window-size=320,200", "--virtual-time-budget=4000", "--dump-dom"]
-    told = subprocess.run(
-        [browser, *words, f"http://{served.web.address}/?ask=5.9,0.2,0.1"],
-        capture_output=True, text=True, timeout=240,
-    )  # fmt: skip
-    (body,) = re.findall(r"<body[^>]*>", told.stdout)
-    shown = {name: html.unescape(value) for name, value in re.findall(r'data-(\w+)="([^"]*)"', body)}
-    assert int(shown["tiles"]) == len(ask(served, "state")["tiles"]) > 0
-    answer, expected = json.loads(shown["answer"]), client.occupancy([[5.9, 0.2, 0.1]])
-    assert answer["point"] == [5.9, 0.2, 0.1]
-    assert answer["mean"] == pytest.approx(float(expected.mean[0]), abs=1e-6)
-    assert answer["sd"] == pytest.approx(float(np.sqrt(expected.var[0])), abs=1e-6)
-    assert f"{answer['mean']:.4f}" in told.stdout, "in the panel"
+    width, height = 800, 500
+
+    def answer_in(browser: Browser) -> Any:
+        text = browser.evaluate("document.body?.dataset.answer")
+        return None if text is None else json.loads(text)
+
+    with Browser(program, tmp_path, width, height, 120.0) as browser:
+        browser.open(f"http://{served.web.address}/?ask=5.9,0.2,0.1")
+        asked = until(lambda: answer_in(browser), "the point of the address", 120.0)
+        assert asked["point"] == [5.9, 0.2, 0.1]
+        n_tiles = len(ask(served, "state")["tiles"])
+        assert browser.evaluate("document.body.dataset.tiles") == str(n_tiles) != "0"
+        browser.evaluate("document.getElementById('cut').click()")
+        until(lambda: browser.evaluate("document.body?.dataset.slices"), "the slice", 120.0)
+        browser.click(width // 3, height // 2)
+        clicked = until(
+            lambda: (a := answer_in(browser)) and a["point"] != asked["point"] and a, "the click", 120.0
+        )
+        shown = browser.evaluate("document.getElementById('answer').innerText")
+    for answer in (asked, clicked):
+        expected = client.occupancy([answer["point"]])
+        assert answer["mean"] == pytest.approx(float(expected.mean[0]), abs=1e-6)
+        assert answer["sd"] == pytest.approx(float(np.sqrt(expected.var[0])), abs=1e-6)
+        assert answer["observed"] == bool(expected.observed[0])
+    assert f"{clicked['mean']:.4f}" in shown
