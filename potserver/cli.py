@@ -6,6 +6,7 @@ import argparse
 import sys
 from collections.abc import Sequence
 
+from potclient.commands.completion import add_completion_flag
 from potclient.commands.parsers import CommandParser
 from potclient.errors import DatasetError, UsageError
 from potschemas import __version__
@@ -46,6 +47,7 @@ def _parser() -> argparse.ArgumentParser:
         prog="potserver", description=_ABOUT, epilog=_FIRST_STEPS, formatter_class=Formatter
     )
     parser.add_argument("--version", action="version", version=f"potserver {__version__}")
+    add_completion_flag(parser)
     commands = parser.add_subparsers(title="commands", metavar="COMMAND")
     for verb in (serve, config, atoms, maps, evaluation, demo):
         verb.add(commands)

@@ -82,6 +82,15 @@ class StoreSettings:
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class WebSettings:
+    """What is told over HTTP: a page with the map, `/live`, `/ready` and `/metrics` for Prometheus."""
+
+    listen: Annotated[
+        str | None, "HOST:PORT; unset: nothing is told. Whoever reaches it may read the maps"
+    ] = None
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class LogSettings:
     """What goes to stderr."""
 
@@ -106,6 +115,7 @@ class Settings:
     poses: PoseSettings = dataclasses.field(default_factory=PoseSettings)
     atoms: AtomSettings = dataclasses.field(default_factory=AtomSettings)
     store: StoreSettings = dataclasses.field(default_factory=StoreSettings)
+    web: WebSettings = dataclasses.field(default_factory=WebSettings)
     log: LogSettings = dataclasses.field(default_factory=LogSettings)
     # `mapping.profile` sets what the other keys of the table start from
     mapping: MappingSettings = dataclasses.field(default_factory=MappingSettings)

@@ -23,6 +23,9 @@ class Reader(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     format: str = "auto"
     poses: str | None = None
     frame: str = "auto"
+    origin: tuple[float, float, float] | None = None
+    layout: str = "auto"
+    odometry: str | None = None
     no_return_m: float | None = None
     min_range_m: float = 0.0
     max_range_m: float | None = None

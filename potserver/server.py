@@ -3,8 +3,8 @@
     with MapServer(Settings(), listen="tcp/127.0.0.1:0") as server:
         client = MapClient(server.endpoint)
 
-Threads, besides Zenoh's own and those of `MapNode`: the query workers, the stats publisher and its queryable, and one a
-store for snapshots.
+Threads, besides Zenoh's own and those of `MapNode`: the query workers, the stats publisher and its queryable, one a
+store for snapshots, and, with `web.listen`, those of HTTP.
 """
 
 from __future__ import annotations
@@ -19,14 +19,13 @@ from types import TracebackType
 
 import zenoh
 
-from potschemas import __version__, keys
+from potschemas import __version__, keys, messages
 from potserver.adapters.presence import OtherServers
 from potserver.adapters.query_pool import QueryPool
 from potserver.adapters.questions.registry import warm_up
 from potserver.adapters.session import build_config, close_session, open_session
-from potserver.adapters.stats import StatsPublisher, encode_stats
+from potserver.adapters.stats import StatsPublisher, stats_now
 from potserver.atoms.store import AtomStore
-from potserver.codec.base import Wire
 from potserver.config import Settings, as_tree
 from potserver.domain.dictionary import AtomDictionary
 from potserver.health import Health
@@ -35,6 +34,7 @@ from potserver.mapping.service import MappingService
 from potserver.node import FLUSH_S, QUEUE_MESSAGES, MapNode, Shared
 from potserver.numerics.threads import default_threads
 from potserver.storage.map_store import MapStore, MemoryOnly
+from potserver.web.listener import Served, WebListener
 
 log = get_logger("potserver.server")
 
@@ -74,6 +74,7 @@ class MapServer:
         self.pool: QueryPool | None = None
         self._stats: StatsPublisher | None = None
         self._stores: dict[str, MapStore] = {}
+        self.web: WebListener | None = None
         self._stopping = threading.Event()
         self._lock = threading.Lock()  # start and stop, one at a time
         self._stopped_clean: bool | None = None
@@ -96,32 +97,13 @@ class MapServer:
             s = self.settings
             log.info("server_starting", version=__version__)
             log.debug("settings_in_use", settings=as_tree(s))
-            mappers = [self._make_map(map_id) for map_id in s.maps]
-            config = build_config(s.zenoh, root=s.root, wire_guard_bytes=s.limits.wire_guard_bytes)
+            if s.web.listen is not None:  # first: who asks whether we are ready hears "starting" until we are
+                self.web = WebListener(s.web.listen, self._served())
             try:
-                stamps = [self._open_store(mapper) for mapper in mappers]
-                self._session, self._endpoints = open_session(config)
+                self._start(s)
             except BaseException:
-                self._close_stores()
+                self._close_web()
                 raise
-            atexit.register(self.stop)  # leaving with Zenoh open would abort the process
-            try:
-                served = [keys.MapKeys(s.root, map_id) for map_id in s.maps]
-                with OtherServers(self._session, served) as others:
-                    others.refuse()
-                    _warm_up(mappers[0])  # all maps share the compiled numerics
-                    others.refuse()  # one that was warming up beside us
-                self._serve(self._session, mappers, stamps)
-            except BaseException:
-                self._teardown(0.0)
-                raise
-            log.info(
-                "server_started",
-                server_id=s.server_id,
-                endpoints=self._endpoints,
-                maps={mapper.map_id: mapper.n_scans for mapper in mappers},
-                store=s.store.directory or "memory only",
-            )
 
     def stop(self, drain_timeout_s: float | None = None) -> bool:
         """Take no more clouds, map those that wait, answer everybody, and close. Never hangs; may be called
@@ -165,15 +147,65 @@ class MapServer:
 
     @property
     def state(self) -> str:
-        """`serving`, or `draining` when no map takes clouds any more."""
+        """`starting`, `serving`, or `draining` when no map takes clouds any more."""
+        if not self.nodes and not self._stopping.is_set():
+            return "starting"
         serving = any(node.intake.is_admitting for node in self.nodes.values())
         return "serving" if serving and not self._stopping.is_set() else "draining"
+
+    def stats(self) -> messages.Stats:
+        """The counters now, as `pot.stats.v1` has them."""
+        nodes = list(self.nodes.values())
+        pool = self.pool
+        return stats_now(
+            self.health,
+            server_id=self.settings.server_id,
+            state=self.state,
+            n_robots=sum(node.robots.n_alive for node in nodes),
+            queues={
+                "clouds.depth": sum(node.intake.depth for node in nodes),
+                "clouds.bytes": sum(node.intake.n_bytes for node in nodes),
+                "queries.depth": pool.depth if pool else 0,
+                "queries.bytes": pool.n_bytes if pool else 0,
+                "outbox.prompt": sum(node.prompt.depth for node in nodes),
+                "outbox.bulk": sum(node.bulk.depth for node in nodes),
+            },
+            maps={node.map_id: node.mapper.state for node in nodes},
+        )
 
     def mapper(self, map_id: str) -> MappingService:
         """The mapper of one map, for programs that embed the server. Only read from it."""
         return self.nodes[map_id].mapper
 
     # --- parts ----------------------------------------------------------------------------------------------
+
+    def _start(self, s: Settings) -> None:
+        mappers = [self._make_map(map_id) for map_id in s.maps]
+        config = build_config(s.zenoh, root=s.root, wire_guard_bytes=s.limits.wire_guard_bytes)
+        try:
+            stamps = [self._open_store(mapper) for mapper in mappers]
+            self._session, self._endpoints = open_session(config)
+        except BaseException:
+            self._close_stores()
+            raise
+        atexit.register(self.stop)  # leaving with Zenoh open would abort the process
+        try:
+            served = [keys.MapKeys(s.root, map_id) for map_id in s.maps]
+            with OtherServers(self._session, served) as others:
+                others.refuse()
+                _warm_up(mappers[0])  # all maps share the compiled numerics
+                others.refuse()  # one that was warming up beside us
+            self._serve(self._session, mappers, stamps)
+        except BaseException:
+            self._teardown(0.0)
+            raise
+        log.info(
+            "server_started",
+            server_id=s.server_id,
+            endpoints=self._endpoints,
+            maps={mapper.map_id: mapper.n_scans for mapper in mappers},
+            store=s.store.directory or "memory only",
+        )
 
     def _serve(
         self, session: zenoh.Session, mappers: list[MappingService], stamps: list[dict[str, int]]
@@ -189,30 +221,9 @@ class MapServer:
         for mapper, newest in zip(mappers, stamps, strict=True):
             keeper = self._stores.get(mapper.map_id, MemoryOnly())
             self.nodes[mapper.map_id] = MapNode(mapper, keeper, newest, shared)
-        self._stats = StatsPublisher(
-            session, keys.stats_key(s.root, s.server_id), self._encode_stats, s.limits
-        )
+        self._stats = StatsPublisher(session, keys.stats_key(s.root, s.server_id), self.stats, s.limits)
         for node in self.nodes.values():
             node.announce(s.server_id)
-
-    def _encode_stats(self) -> Wire:
-        nodes = list(self.nodes.values())
-        pool = self.pool
-        return encode_stats(
-            self.health,
-            server_id=self.settings.server_id,
-            state=self.state,
-            n_robots=sum(node.robots.n_alive for node in nodes),
-            queues={
-                "clouds.depth": sum(node.intake.depth for node in nodes),
-                "clouds.bytes": sum(node.intake.n_bytes for node in nodes),
-                "queries.depth": pool.depth if pool else 0,
-                "queries.bytes": pool.n_bytes if pool else 0,
-                "outbox.prompt": sum(node.prompt.depth for node in nodes),
-                "outbox.bulk": sum(node.bulk.depth for node in nodes),
-            },
-            maps={node.map_id: node.mapper.state for node in nodes},
-        )
 
     def _open_store(self, mapper: MappingService) -> dict[str, int]:
         """Give a map what was kept of it; the newest stamps of its robots."""
@@ -234,6 +245,17 @@ class MapServer:
         closed = [store.close() for store in stores.values()]  # all of them, whatever the first says
         return all(closed)
 
+    def _served(self) -> Served:
+        """What is told over HTTP."""
+
+        def endpoint() -> str | None:
+            return self._endpoints[0] if self._endpoints and self.state == "serving" else None
+
+        return Served(lambda: self.state, self.stats, endpoint, self.settings.maps, self.settings.root)
+
+    def _close_web(self) -> bool:
+        return self.web is None or self.web.close()
+
     def _teardown(self, drain_timeout_s: float) -> bool:
         session = self._session
         if session is None:
@@ -253,7 +275,7 @@ class MapServer:
             self._stats.close()
         ended = [node.close() for node in nodes]
         kept = self._close_stores()  # after the writers: a last snapshot of what they made
-        clean = all([*drained, answered, *ended, kept, close_session(session, _CLOSE_S)])
+        clean = all([*drained, answered, *ended, kept, close_session(session, _CLOSE_S), self._close_web()])
         self._session = None
         log.info("server_stopped", clean=clean, counters=self.health.counters())
         return clean

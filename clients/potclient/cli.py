@@ -1,4 +1,4 @@
-"""`potclient publish | query | grid | rays | risk | export | mirror | watch | load | info | atoms | map | town`."""
+"""`potclient publish | query | grid | rays | risk | export | mirror | watch | view | load | info | atoms | map | town`."""
 
 from __future__ import annotations
 
@@ -20,15 +20,17 @@ from potclient.commands import (
     rays,
     risk,
     town,
+    view,
     watch,
 )
+from potclient.commands.completion import add_completion_flag
 from potclient.commands.parsers import CommandParser
 from potclient.commands.shared import EXIT_FAILED, EXIT_INTERRUPTED, EXIT_USAGE, complain
 from potclient.errors import DatasetError, MapServerError, PotclientError, UsageError
 from potclient.zenoh_config import DEFAULT_ENDPOINT
 from potschemas import __version__
 
-_VERBS = (publish, query, grid, rays, risk, export, mirror, watch, load, info, atoms, map, town)
+_VERBS = (publish, query, grid, rays, risk, export, mirror, watch, view, load, info, atoms, map, town)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -73,6 +75,7 @@ def build_parser() -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--version", action="version", version=f"potclient {__version__}")
+    add_completion_flag(parser)
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
     for verb in _VERBS:
         verb.add(commands)

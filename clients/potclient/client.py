@@ -31,6 +31,7 @@ from potclient.questions.risk import Risk
 from potclient.questions.tiles import MIRROR_MARGIN_M
 from potclient.results import FeedCounts, Receipt, TransportedParams
 from potclient.session import SessionOptions
+from potclient.watched import WatchedCloud, watch_clouds
 from potschemas import messages
 from potschemas.keys import DEFAULT_ROOT, stats_key
 
@@ -559,6 +560,10 @@ class MapClient:
     def watch_stats(self, callback: Callable[[messages.Stats], None], server: str = "*") -> Subscription:
         """Call back with a server's counters once a second."""
         return self._watch(stats_key(self.keys.root, server), messages.Stats, callback, "stats")
+
+    def watch_clouds(self, callback: Callable[[WatchedCloud], None], robot: str = "*") -> Subscription:
+        """Call back with the clouds that robots publish (not those of `integrate`). A slow callback skips to the newest 16."""
+        return watch_clouds(self._link, robot, callback)
 
     def watch_params(self, callback: Callable[[TransportedParams], None], robot: str = "*") -> Subscription:
         """Call back with transported parameters. A slow callback misses some: their numbers jump."""

@@ -6,25 +6,19 @@ Everything comes from `q/params` and `q/grid`, part by part, so that a map may b
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from potclient.arrays import Float64
+from potclient.cells import CellBox, MapSource, Progress, grids
 from potclient.errors import UsageError
 from potclient.files import whole
+from potclient.ground import Ground
 from potclient.kernels import KernelSet
-from potclient.occupancy import Grid
 from potclient.octomap import KEY_ORIGIN, OcTreeBuilder, write_bt
-from potschemas import messages
 
-Int64 = NDArray[np.int64]
-Progress = Callable[[int, int], None]  # (parts done, parts in all)
-
-_TILE_CELLS = 250_000  # of one question, at most
 _PLY_HEADER_BYTES = 1024
 # Nav2's map_server takes 205 for unknown only where free_thresh does not exceed 50/255 = 0.1961
 _OCCUPIED_PIXEL, _FREE_PIXEL, _UNKNOWN_PIXEL = 0, 254, 205
@@ -37,71 +31,11 @@ _PLY_FIELDS: tuple[tuple[str, str, str], ...] = (
 )
 
 
-class MapSource(Protocol):
-    """Where files are made from: a `MapClient`, or a map that is not served but answers like one."""
-
-    def info(self) -> messages.Info: ...
-    def params_parts(
-        self, lower: ArrayLike | None = None, upper: ArrayLike | None = None
-    ) -> Iterator[tuple[int, int, KernelSet]]: ...
-    def grid(self, lower: ArrayLike, upper: ArrayLike, resolution: float) -> Grid: ...
-
-
 class Exported(NamedTuple):
     """What a file holds."""
 
     n: int  # kernels, pixels or voxels of known state
     revisions: tuple[int, ...]  # of the map, ascending; several where it changed meanwhile
-
-
-class CellBox(NamedTuple):
-    """A box of cells; cell (i, j, k) spans [i, i + 1] x [j, j + 1] x [k, k + 1] times the resolution, in the map frame."""
-
-    first: Int64  # (3,)
-    stop: Int64  # (3,) one past the last
-    resolution: float  # m
-    raised_m: float = 0.0  # the cells are asked for this much above their centres
-
-    @classmethod
-    def around(cls, lower: ArrayLike, upper: ArrayLike, resolution: float) -> CellBox:
-        """The cells that a box (m, map frame) meets; a flat box has one layer, asked for at its height.
-
-        Raises:
-            UsageError: corners that are not finite, or an upper one below the lower one.
-        """
-        low, high = np.asarray(lower, np.float64), np.asarray(upper, np.float64)
-        if (
-            low.shape != (3,)
-            or high.shape != (3,)
-            or not np.isfinite([low, high]).all()
-            or (high < low).any()
-        ):
-            raise UsageError(f"box from {low.tolist()} to {high.tolist()}: need x y z, lower below upper")
-        # a millionth of slack, so that a box of whole cells has no more than those
-        first = np.floor(low / resolution + 1e-6).astype(np.int64)
-        stop = np.ceil(high / resolution - 1e-6).astype(np.int64)
-        is_flat = low[2] == high[2]
-        raised_m = float(low[2] - (first[2] + 0.5) * resolution) if is_flat else 0.0
-        return cls(first, np.maximum(stop, first + 1), resolution, raised_m)
-
-    def tiles(self, max_cells: int = _TILE_CELLS) -> list[CellBox]:
-        """Parts of at most so many cells, cut at multiples of a power of two, where an octree cuts too."""
-        shape = self.stop - self.first
-        edge = 1
-        while (2 * edge) ** 2 * min(2 * edge, int(shape[2])) <= max_cells:
-            edge *= 2
-        if edge * edge * min(edge, int(shape[2])) > max_cells:
-            raise UsageError(f"a question of {max_cells} cells is too small for a tile")
-        cuts = [
-            np.unique([first, *range(-(-first // edge) * edge, stop, edge), stop])
-            for first, stop in zip(self.first.tolist(), self.stop.tolist(), strict=True)
-        ]
-        return [
-            self._replace(first=np.array([x, y, z]), stop=np.array([x2, y2, z2]))
-            for x, x2 in zip(cuts[0][:-1], cuts[0][1:], strict=True)
-            for y, y2 in zip(cuts[1][:-1], cuts[1][1:], strict=True)
-            for z, z2 in zip(cuts[2][:-1], cuts[2][1:], strict=True)
-        ]
 
 
 def export_ply(
@@ -166,11 +100,31 @@ def export_npz(
     return Exported(len(joined), (joined.map_revision,))
 
 
+class Band(NamedTuple):
+    """The heights above the ground that matter to a robot."""
+
+    ground: Ground
+    low_m: float
+    high_m: float
+
+    def inside(self, tile: CellBox) -> NDArray[np.bool_]:
+        """(nx, ny, nz): which cells of a tile have their centre in the band; none where nobody knows the ground."""
+        x, y, z = tile.centres()
+        above = z - self.ground.at(x, y)[:, :, None]
+        return np.asarray((above >= self.low_m) & (above <= self.high_m))
+
+    def heights(self) -> tuple[float, float]:
+        """m, map frame: the lowest and the highest of it."""
+        low, high = np.nanmin(self.ground.height), np.nanmax(self.ground.height)
+        return float(low + self.low_m), float(high + self.high_m)
+
+
 def export_pgm(
     source: MapSource,
     path: Path,
     box: CellBox,
     *,
+    band: Band | None = None,
     occupied_above: float = 0.65,
     free_below: float = 0.25,
     progress: Progress | None = None,
@@ -184,6 +138,7 @@ def export_pgm(
     Args:
         path: `*.pgm`; the YAML gets the same name with the suffix `.yaml`.
         box: Columns and the heights that count.
+        band: Cells outside do not count, and columns without ground are unknown.
         occupied_above, free_below: Of the occupancy probability.
     Raises:
         UsageError: thresholds out of order, or a name that is the YAML's.
@@ -197,9 +152,11 @@ def export_pgm(
     nx, ny, _ = (box.stop - box.first).tolist()
     likeliest = np.full((nx, ny), -1.0, np.float32)  # -1: nothing observed
     revisions = set()
-    for tile, grid in _grids(source, box, progress):
+    wanted = None if band is None else lambda tile: bool(band.inside(tile).any())
+    for tile, grid in grids(source, box, progress, wanted):
         x, y = (slice(int(tile.first[a] - box.first[a]), int(tile.stop[a] - box.first[a])) for a in (0, 1))
-        column = np.where(grid.observed, grid.mean, np.float32(-1)).max(axis=2)
+        counts = grid.observed if band is None else grid.observed & band.inside(tile)
+        column = np.where(counts, grid.mean, np.float32(-1)).max(axis=2)
         likeliest[x, y] = np.maximum(likeliest[x, y], column)
         revisions.add(grid.revision)
     pixels = np.full((nx, ny), _UNKNOWN_PIXEL, np.uint8)
@@ -244,7 +201,7 @@ def export_bt(
         )
     tree = OcTreeBuilder()
     n, revisions = 0, set()
-    for tile, grid in _grids(source, box, progress):
+    for tile, grid in grids(source, box, progress):
         occupied = grid.observed & (grid.mean >= occupied_above)
         known = occupied | (grid.observed & (grid.mean < free_below))
         tree.add(np.argwhere(known) + tile.first + KEY_ORIGIN, occupied[known])
@@ -252,20 +209,6 @@ def export_bt(
         revisions.add(grid.revision)
     write_bt(path, tree.leaves(), box.resolution)
     return Exported(n, tuple(sorted(revisions)))
-
-
-def _grids(source: MapSource, box: CellBox, progress: Progress | None) -> Iterator[tuple[CellBox, Grid]]:
-    """The box, tile by tile."""
-    tiles = box.tiles(min(_TILE_CELLS, source.info().limits.max_grid_cells))
-    for done, tile in enumerate(tiles, 1):
-        raised = np.array([0.0, 0.0, box.raised_m])
-        lower, upper = (corner * box.resolution + raised for corner in (tile.first, tile.stop))
-        grid = source.grid(lower, upper, box.resolution)
-        if grid.shape != tuple((tile.stop - tile.first).tolist()):
-            raise UsageError(f"a grid of {grid.shape} cells came for {(tile.stop - tile.first).tolist()}")
-        yield tile, grid
-        if progress is not None:
-            progress(done, len(tiles))
 
 
 def _ply_rows(kernels: KernelSet) -> NDArray[np.void]:
@@ -287,15 +230,3 @@ def _check_thresholds(occupied_above: float, free_below: float) -> None:
         raise UsageError(
             f"thresholds: occupied above {occupied_above:g}, free below {free_below:g}; need 0 < free <= occupied < 1"
         )
-
-
-def bounds_of(source: MapSource) -> tuple[Float64, Float64]:
-    """The corners of the box of all hinges, m, map frame.
-
-    Raises:
-        UsageError: the map is empty.
-    """
-    info = source.info()
-    if info.lower is None or info.upper is None:
-        raise UsageError("the map is empty; publish something first, or give --lower and --upper")
-    return np.asarray(info.lower, np.float64), np.asarray(info.upper, np.float64)

@@ -353,13 +353,18 @@ class Link:
         Raises:
             ClosedError: the link is closed.
         """
+        return self.subscribe_samples(
+            key, lambda sample: callback(decoded(sample.payload, kind)), name, channel
+        )
+
+    def subscribe_samples(
+        self, key: str, deliver: Callable[[zenoh.Sample], None], name: str, channel: Any
+    ) -> Subscription:
+        """As `subscribe`, for who needs the keys of the samples too."""
         with self._lock:
             self.check_open()
             subscription = Subscription(
-                self._session.declare_subscriber(key, channel),
-                lambda sample: callback(decoded(sample.payload, kind)),
-                name,
-                self._forget,
+                self._session.declare_subscriber(key, channel), deliver, name, self._forget
             )
             return self._add(subscription)
 

@@ -12,7 +12,7 @@ import zenoh
 from potschemas import messages
 from potserver.adapters.queryable import Queryable
 from potserver.adapters.replies import check_query, payload_of, reply, reply_error
-from potserver.codec.base import Wire, decode, encode
+from potserver.codec.base import decode, encode
 from potserver.domain.map_state import MapState
 from potserver.errors import PotserverError
 from potserver.health import Health, rss_bytes
@@ -29,15 +29,15 @@ class StatsPublisher:
     """Publishes the counters of a server, and answers who asks for them."""
 
     def __init__(
-        self, session: zenoh.Session, key: str, encode_now: Callable[[], Wire], limits: Limits
+        self, session: zenoh.Session, key: str, stats_now: Callable[[], messages.Stats], limits: Limits
     ) -> None:
-        self._encode_now = encode_now
+        self._stats_now = stats_now
         self._stop = threading.Event()
         # background: the first to go when a link is full
         self._publisher = session.declare_publisher(
             key, priority=zenoh.Priority.BACKGROUND, congestion_control=zenoh.CongestionControl.DROP
         )
-        self._queryable = _StatsQueryable(session, key, encode_now, limits)
+        self._queryable = _StatsQueryable(session, key, stats_now, limits)
         self._threads = [
             spawn("stats-publisher", self._publish),
             spawn("stats-queryable", self._queryable.run),
@@ -56,7 +56,7 @@ class StatsPublisher:
         while not self._stop.wait(max(0.0, next_s - time.monotonic())):
             next_s = max(next_s + PERIOD_S, time.monotonic())
             try:
-                wire = self._encode_now()
+                wire = encode(self._stats_now())
                 self._publisher.put(wire.payload, encoding=wire.encoding)
             except Exception:
                 log.exception("stats_failed")
@@ -66,15 +66,15 @@ class _StatsQueryable(Queryable):
     """Answers at once: the counters are there, and nobody else waits behind."""
 
     def __init__(
-        self, session: zenoh.Session, key: str, encode_now: Callable[[], Wire], limits: Limits
+        self, session: zenoh.Session, key: str, stats_now: Callable[[], messages.Stats], limits: Limits
     ) -> None:
-        self._key, self._encode_now, self._limits = key, encode_now, limits
+        self._key, self._stats_now, self._limits = key, stats_now, limits
         super().__init__(session, key)
 
     def admit(self, query: zenoh.Query) -> None:
         check_query(query, messages.StatsQuery, self._limits.max_query_bytes, "stats query")
         decode(payload_of(query), messages.StatsQuery)
-        wire = self._encode_now()
+        wire = encode(self._stats_now())
         with query:
             reply(query, self._key, wire)
 
@@ -83,7 +83,7 @@ class _StatsQueryable(Queryable):
             reply_error(query, error)
 
 
-def encode_stats(
+def stats_now(
     health: Health,
     *,
     server_id: str,
@@ -91,7 +91,7 @@ def encode_stats(
     n_robots: int,
     queues: dict[str, int],
     maps: Mapping[str, MapState],
-) -> Wire:
+) -> messages.Stats:
     """The counters now.
 
     Args:
@@ -102,22 +102,20 @@ def encode_stats(
         queues: What waits, by the queue's name.
         maps: One state of each.
     """
-    return encode(
-        messages.Stats(
-            server=server_id,
-            stamp_ns=time.time_ns(),
-            uptime_s=health.uptime_s,
-            state=state,
-            counters=health.counters() | {"robots.alive": n_robots},
-            queues=queues,
-            latencies={
-                kind: messages.LatencySummary(**dataclasses.asdict(latency))
-                for kind, latency in health.latencies().items()
-            },
-            rss_bytes=rss_bytes(),
-            map_kernels={map_id: len(held.snapshot) for map_id, held in maps.items()},
-            map_scores={map_id: _scores(held) for map_id, held in maps.items()},
-        )
+    return messages.Stats(
+        server=server_id,
+        stamp_ns=time.time_ns(),
+        uptime_s=health.uptime_s,
+        state=state,
+        counters=health.counters() | {"robots.alive": n_robots},
+        queues=queues,
+        latencies={
+            kind: messages.LatencySummary(**dataclasses.asdict(latency))
+            for kind, latency in health.latencies().items()
+        },
+        rss_bytes=rss_bytes(),
+        map_kernels={map_id: len(held.snapshot) for map_id, held in maps.items()},
+        map_scores={map_id: _scores(held) for map_id, held in maps.items()},
     )
 
 

@@ -43,6 +43,7 @@ examples:
   potserver serve --store /var/lib/site/maps             keep the maps there; --in-memory: forget them at the end
   potserver serve --connect tcp/router:7447 --listen tcp/127.0.0.1:7448
                                                          join a Zenoh router (ROS 2 hosts have one on 7447)
+  potserver serve --web 127.0.0.1:8080                   a page with the map; /live, /ready, /metrics (Prometheus)
   potserver serve --settings site.toml --set limits.max_cloud_points=100000
   POTSERVER_MAPS=ground,roof potserver serve             every setting is also a variable
 

@@ -32,6 +32,7 @@ _SETTING_OF_FLAG = {
     "profile": "mapping.profile",
     "dictionary": "dictionary",
     "store": "store.directory",
+    "web": "web.listen",
     "threads": "threads",
     "drain_timeout": "drain_timeout_s",
     "log_level": "log.level",
@@ -119,6 +120,11 @@ def add_settings_flags(parser: argparse.ArgumentParser) -> None:
     )
     store.add_argument(
         "--in-memory", action="store_const", dest="store", const="", help="forget the maps at the end"
+    )
+    server.add_argument(
+        "--web",
+        metavar="HOST:PORT",
+        help="serve a page with the map there, /live, /ready and /metrics (Prometheus)",
     )
     server.add_argument(
         "--drain-timeout", type=float, metavar="S", help="seconds for waiting clouds at SIGTERM [10]"

@@ -20,6 +20,7 @@ COMMANDS = (
     "risk",
     "export",
     "mirror",
+    "view",
     "watch",
     "load",
     "info",
@@ -87,7 +88,8 @@ def test_the_help_lists_every_command(capsys: pytest.CaptureFixture[str]) -> Non
 def test_the_client_imports_nothing_heavy() -> None:
     program = """
 import sys, potclient, potclient.cli, potclient.loadtest, potclient.play
-heavy = {"torch", "open3d", "numba", "potserver", "matplotlib", "rich", "pypcd4", "plyfile", "scipy"} & set(sys.modules)
+heavy = {"torch", "open3d", "numba", "potserver", "matplotlib", "rich", "pypcd4", "plyfile", "scipy", "rerun",
+         "skimage", "trimesh", "pyarrow", "laspy", "kiss_icp"} & set(sys.modules)
 sys.exit(f"imported {sorted(heavy)}" if heavy else 0)
 """
     done = subprocess.run(

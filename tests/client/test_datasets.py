@@ -15,11 +15,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from potclient.datasets import DatasetError, GeneratedScene, RecordedScan, Recording, open_dataset
-from potclient.datasets.clouds import read_cloud, read_viewpoint
+from potclient.datasets.files import read_beams, read_viewpoint
 from potclient.datasets.scans import growing, limit_range, natural_key
 
 Points = np.ndarray[Any, np.dtype[np.float32]]
 POINTS: Points = np.array([[1, 2, 3], [4, 5, 6.5], [-7, 8, 0.25], [0.5, 0.5, 0.5]], np.float32)
+
+
+def points_of(path: Path) -> np.ndarray[Any, np.dtype[np.floating[Any]]]:
+    return read_beams(path).points
 
 
 def yaw_pose(x: float, y: float, yaw: float) -> np.ndarray[Any, np.dtype[np.float64]]:
@@ -62,27 +66,27 @@ def ply(points: Points, *, ascii_: bool = False) -> bytes:
 @pytest.mark.parametrize("data", ["ascii", "binary"])
 def test_pcd_points_come_back(tmp_path: Path, data: str) -> None:
     (tmp_path / "a.pcd").write_bytes(pcd(POINTS, data=data))
-    np.testing.assert_array_equal(read_cloud(tmp_path / "a.pcd"), POINTS)
+    np.testing.assert_array_equal(points_of(tmp_path / "a.pcd"), POINTS)
 
 
 def test_pcd_with_bytes_after_the_data_and_one_ascii_point(tmp_path: Path) -> None:
     (tmp_path / "a.pcd").write_bytes(pcd(POINTS, extra=b"\0" * 77))
-    np.testing.assert_array_equal(read_cloud(tmp_path / "a.pcd"), POINTS)
+    np.testing.assert_array_equal(points_of(tmp_path / "a.pcd"), POINTS)
     (tmp_path / "b.pcd").write_bytes(pcd(POINTS[:1], data="ascii"))
-    np.testing.assert_array_equal(read_cloud(tmp_path / "b.pcd"), POINTS[:1])
+    np.testing.assert_array_equal(points_of(tmp_path / "b.pcd"), POINTS[:1])
 
 
 def test_pcd_compressed(tmp_path: Path) -> None:
     from pypcd4 import Encoding, PointCloud
 
     PointCloud.from_xyz_points(POINTS).save(tmp_path / "a.pcd", encoding=Encoding.BINARY_COMPRESSED)
-    np.testing.assert_array_equal(read_cloud(tmp_path / "a.pcd"), POINTS)
+    np.testing.assert_array_equal(points_of(tmp_path / "a.pcd"), POINTS)
 
 
 @pytest.mark.parametrize("ascii_", [False, True])
 def test_ply_points_come_back(tmp_path: Path, ascii_: bool) -> None:
     (tmp_path / "a.ply").write_bytes(ply(POINTS, ascii_=ascii_))
-    np.testing.assert_array_equal(read_cloud(tmp_path / "a.ply"), POINTS)
+    np.testing.assert_array_equal(points_of(tmp_path / "a.ply"), POINTS)
 
 
 @pytest.mark.parametrize(
@@ -101,10 +105,10 @@ def test_ply_points_come_back(tmp_path: Path, ascii_: bool) -> None:
 def test_damaged_clouds_are_named(tmp_path: Path, name: str, content: bytes, message: str) -> None:
     (tmp_path / name).write_bytes(content)
     with pytest.raises(DatasetError, match=message) as caught:
-        read_cloud(tmp_path / name)
+        points_of(tmp_path / name)
     assert name in str(caught.value)
     with pytest.raises(DatasetError, match="cannot be read"):
-        read_cloud(tmp_path / ("absent" + name[1:]))
+        points_of(tmp_path / ("absent" + name[1:]))
 
 
 def test_a_folder_is_read_in_natural_order_with_its_poses(tmp_path: Path) -> None:
@@ -209,7 +213,7 @@ def test_pose_files_that_do_not_fit(tmp_path: Path, lines: str, message: str) ->
 def test_what_a_cloud_folder_lacks_is_said(tmp_path: Path) -> None:
     for i in range(2):
         (tmp_path / f"{i}.ply").write_bytes(ply(POINTS))
-    with pytest.raises(DatasetError, match=r"no poses\.txt"):
+    with pytest.raises(DatasetError, match=r"no poses: none of poses\.txt"):
         open_dataset(tmp_path)
     with pytest.raises(DatasetError, match="no file other"):
         open_dataset(tmp_path, poses="other.txt")
@@ -273,6 +277,12 @@ def test_what_a_kitti_folder_lacks_is_said(kitti: Path) -> None:
     (kitti / "poses.txt").unlink()
     with pytest.raises(DatasetError, match=r"no poses\.txt"):
         open_dataset(kitti)
+
+
+@pytest.mark.parametrize("said", [{"frame": "world"}, {"origin": (0, 0, 1)}, {"layout": "xyz"}])
+def test_what_a_recording_brings_itself_is_not_said_twice(kitti: Path, said: dict[str, Any]) -> None:
+    with pytest.raises(DatasetError, match=f"what {next(iter(said))} would say"):
+        open_dataset(kitti, **said)
 
 
 def test_a_truncated_bin_is_named(kitti: Path) -> None:
@@ -511,6 +521,9 @@ def overlap_m(a: RecordedScan, others: Recording) -> float:
         ("kitti_odometry_00", {}, 4, 124_668, False),
         ("kitti_odometry_00", {"poses": "poses_velo_icp.txt"}, 4, 124_668, False),
         ("kitti_raw_drive0005", {}, 20, 122_942, False),
+        ("kitti_07_keyframes", {}, 5, 21_562, False),
+        ("argoverse2_pair", {}, 4, 51_785, False),
+        ("ddad_scene02", {"origin": (0, 0, 1.5)}, 3, 47_230, False),
         ("balm_garage", {}, 20, 76_363, False),
         ("carla_town03_houses", {}, 4, 106_809, False),
         ("carla_town04_mountain_road", {}, 4, 119_892, False),
@@ -545,7 +558,37 @@ def test_shared_data_reads_and_lines_up(
 def test_every_shared_cloud_file_can_be_read(shared_data: Callable[[str], Path]) -> None:
     for folder in ("small_gicp_pair", "single_scans"):
         for file in sorted(shared_data(folder).glob("*.ply")):
-            assert len(read_cloud(file)) > 10_000
+            assert len(points_of(file)) > 10_000
     for folder in ("kitti_raw_drive0005", "la3dm_sim_structured"):
         for file in sorted(shared_data(folder).glob("*.pcd")):
-            assert np.isfinite(read_cloud(file)).all()
+            assert np.isfinite(points_of(file)).all()
+
+
+def test_every_shared_single_scan_plays_alone(shared_data: Callable[[str], Path]) -> None:
+    folder = shared_data("single_scans")
+    n_points = {file.name[:4]: len(open_dataset(file)[0]) for file in folder.iterdir()}
+    assert n_points == {"argo": 91_083, "kitt": 126_596, "nclt": 23_546, "nusc": 34_688, "rell": 37_334}
+    with pytest.raises(DatasetError, match=r"1 PLY .*3 binary .*1 nuScenes .*potclient publish"):
+        open_dataset(folder)
+
+
+def test_both_lidars_of_argoverse_see_from_their_own_places(shared_data: Callable[[str], Path]) -> None:
+    """Each laser has one elevation, seen from where its lidar is: from the other's place it has several."""
+    up = open_dataset(shared_data("argoverse2_pair"))[0]
+    height = up.T_map_sensor[2, 3] - open_dataset(shared_data("argoverse2_pair"))[1].T_map_sensor[2, 3]
+    assert height == pytest.approx(0.115, abs=0.01)
+
+    def spread(points: Points) -> float:
+        elevation = np.sort(np.degrees(np.arctan2(points[:, 2], np.hypot(points[:, 0], points[:, 1]))))
+        return float(np.median(np.diff(elevation[:: len(elevation) // 2000])))
+
+    assert spread(up.points) < spread(up.points + np.array([0, 0, height], np.float32))
+
+
+def test_folders_that_cannot_play_say_what_would(shared_data: Callable[[str], Path]) -> None:
+    with pytest.raises(DatasetError, match=r"2 clouds .*--odometry kiss-icp"):
+        open_dataset(shared_data("small_gicp_pair"))
+    with pytest.raises(DatasetError, match=r"OctoMap.*potserver map import .*geb079\.bt"):
+        open_dataset(shared_data("octomap_fr079_bt"))
+    with pytest.raises(DatasetError, match=r"qhinge_mean \(92372, 2\)"):
+        open_dataset(shared_data("rss2020_pot"))

@@ -17,6 +17,7 @@ import pytest
 import zenoh
 
 from potclient import MapClient
+from potclient.cli import main
 from potschemas import messages, wire
 from potschemas.answers import AnswerRule
 from potschemas.keys import MapKeys, stats_key
@@ -27,8 +28,11 @@ from potserver.domain.types import KernelSet, MapUpdate, Occupancy, Scan, TileCh
 from potserver.mapping.settings import MappingSettings
 from potserver.server import MapServer
 
+from .rooms import pose, room
+
 DEADLINE_S = 30.0
 ROOT = "pot/v1"
+Run = Callable[..., tuple[int, str, str]]  # the fixtures `run` and `run_at`
 MakeRig = Callable[..., "Rig"]  # the fixture `make_rig`
 _BY_SCHEMA = {kind.schema: kind for kind in messages.ALL_MESSAGES}
 
@@ -435,3 +439,22 @@ def map_client(map_server: MapServer) -> Iterator[MapClient]:
         client.wait_ready()
         client.control("clear")
         yield client
+
+
+@pytest.fixture
+def run_at(capsys: pytest.CaptureFixture[str]) -> Run:
+    """Runs one command line in this process, against the server at an endpoint: status, stdout, stderr."""
+
+    def command(endpoint: str, *words: str) -> tuple[int, str, str]:
+        status = main([*words, "-e", endpoint])
+        captured = capsys.readouterr()
+        return status, captured.out, captured.err
+
+    return command
+
+
+@pytest.fixture
+def run(run_at: Run, map_server: MapServer, map_client: MapClient) -> Run:
+    """Runs one command line against a server whose map has seen a room."""
+    map_client.integrate(room(), pose())
+    return lambda *words: run_at(map_server.endpoint, *words)

@@ -6,7 +6,6 @@ import json
 import re
 import threading
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -14,38 +13,15 @@ import numpy as np
 import pytest
 
 from potclient.atoms import Atom
-from potclient.cli import main
 from potclient.client import MapClient
 from potclient.errors import NoServerError
-from potclient.kernels import KernelSet
 from potschemas.messages import Cloud, ErrorCode, Receipt
-from potserver.server import MapServer
 
-from .conftest import DEADLINE_S
+from .conftest import DEADLINE_S, Run
 from .rooms import pose, room
 from .scripted import ScriptedServer, free_port, receipt_of
 
-Run = Callable[..., tuple[int, str, str]]
 CORNERS = ("--lower", "-2", "-2", "-2", "--upper", "2", "2", "2")
-
-
-@pytest.fixture
-def run_at(capsys: pytest.CaptureFixture[str]) -> Run:
-    """Runs one command line in this process, against the server at an endpoint: status, stdout, stderr."""
-
-    def command(endpoint: str, *words: str) -> tuple[int, str, str]:
-        status = main([*words, "-e", endpoint])
-        captured = capsys.readouterr()
-        return status, captured.out, captured.err
-
-    return command
-
-
-@pytest.fixture
-def run(run_at: Run, map_server: MapServer, map_client: MapClient) -> Run:
-    """Runs one command line against a server whose map has seen a room."""
-    map_client.integrate(room(), pose())
-    return lambda *words: run_at(map_server.endpoint, *words)
 
 
 # --- mistakes ------------------------------------------------------------------------------------------------------
@@ -102,7 +78,11 @@ def test_mistakes_are_one_clear_line_and_status_2(run: Run, words: list[str], me
         (["query", "--file", "absent.txt"], "absent.txt"),
         (["query", "--file", "absent.npy"], "absent.npy"),
         (["export", "bt", "-o", "x"], "--resolution"),
-        (["export", "pgm", "-o", "x", "--resolution", "1", *CORNERS], "--band"),
+        (["export", "pgm", "-o", "x", "--resolution", "1", *CORNERS], "--above-ground LOW HIGH"),
+        (["export", "pgm", "-o", "x", "--resolution", "1", "--band", "1", "0"], "LOW below HIGH"),
+        (["export", "mesh", "-o", "x.ply", "--resolution", "1", "--above-ground", "0", "1"], "for pgm"),
+        (["export", "mesh", "-o", "x.ply", "--resolution", "1", "--free", "0.2"], "leave out"),
+        (["export", "gltf", "-o", "x.ply", "--resolution", "1"], ".glb"),
         (["export", "ply", "-o", "x", "--resolution", "1"], "no cells"),
         (["export", "bt", "-o", "x", "--resolution", "1", "--band", "0", "1"], "--lower"),
         (["query", "1e9", "0", "0"], "out_of_range"),
@@ -393,19 +373,6 @@ def test_risk_of_a_path_in_a_file(run: Run, tmp_path: Path, row: str) -> None:
     assert f"union {tree['path_union_probability']:.4f}" in out
     assert tree["union_probability"][0] == tree["union_probability"][1] < 0.5
     assert tree["resolution_m"] == 0.15
-
-
-@pytest.mark.parametrize("kind", ["ply", "npz", "pgm", "bt"])
-def test_export_writes_each_kind(run: Run, map_client: MapClient, tmp_path: Path, kind: str) -> None:
-    cells = [*CORNERS, "--resolution", "0.5"]
-    grid = {"pgm": [*cells, "--band", "0", "1"], "bt": cells}.get(kind, [])
-    status, out, err = run("export", kind, "-o", str(tmp_path / f"map.{kind}"), *grid)
-    assert (status, err) == (0, "")
-    assert f"revision {map_client.info().map_revision}" in out
-    expected = {f"map.{kind}"} | ({"map.yaml"} if kind == "pgm" else set())
-    assert {p.name for p in tmp_path.iterdir()} == expected
-    if kind == "npz":
-        assert len(KernelSet.load(tmp_path / "map.npz")) == map_client.info().n_kernels
 
 
 # --- info, atoms, map ----------------------------------------------------------------------------------------------

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import importlib.metadata
+import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -86,12 +87,25 @@ def test_the_client_declares_nothing_that_it_does_not_use(root: Path, client_pro
 def test_the_server_imports_only_what_it_declares(root: Path, project: dict) -> None:
     allowed = names(requirements(project))
     found = distributions_imported(root / "potserver")
-    assert {name: file for name, file in found.items() if name not in allowed} == {}
+    of_web = names(requirements(project, "web"))
+    assert {name: file for name, file in found.items() if name not in allowed | of_web} == {}
+
+
+def test_the_server_loads_with_no_extra_installed() -> None:
+    program = """
+import sys
+sys.modules |= dict.fromkeys(("starlette", "uvicorn", "prometheus_client"))
+import potserver.server, potserver.cli
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
 
 
 def test_the_client_needs_nothing_that_the_server_does_not(project: dict, client_project: dict) -> None:
-    theirs = {str(requirement) for requirement in requirements(client_project, "files", "towns", "view")}
-    assert theirs <= {str(requirement) for requirement in requirements(project)}
+    for extra in client_project["optional-dependencies"]:
+        theirs = {str(requirement) for requirement in requirements(client_project, extra)}
+        ours = [extra] if extra in project["optional-dependencies"] else []
+        assert theirs <= {str(requirement) for requirement in requirements(project, *ours)}, extra
 
 
 @pytest.mark.parametrize("python", PYTHONS)

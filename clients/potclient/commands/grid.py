@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from potclient.cells import bounds_of
 from potclient.commands.output_files import output_file, picture_file
 from potclient.commands.shared import (
     EXIT_OK,
@@ -18,7 +19,6 @@ from potclient.commands.shared import (
     say,
 )
 from potclient.errors import UsageError
-from potclient.export import bounds_of
 from potclient.pictures import draw_layer, load_pyplot
 
 

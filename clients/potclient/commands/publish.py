@@ -51,7 +51,10 @@ scan has no receipt or was not accepted. A server that goes away meanwhile has {
 
 DATASET is found out by looking at it:
   a folder with velodyne/*.bin      KITTI odometry, with poses.txt and calib.txt
-  a folder of .pcd or .ply files    with poses.txt (3x4 a line), or a VIEWPOINT in each header
+  a folder of clouds of one kind    .pcd .ply .bin .bin.gz .pcd.bin .npy .npz .las .laz .feather, with poses.txt (KITTI, TUM, or
+                                    a graph's vertices) or a VIEWPOINT in each PCD header; or one such file alone
+  a log of Argoverse 2              two scans a sweep, one of each lidar
+  a DGP scene (DDAD)                scene_*.json and its clouds
   a .log or .clf file (.bz2, .gz)   a CARMEN log of a planar laser
   generated[:2d][:SEED]             a made-up yard
   town:STYLE[:2d][:dynamic][:SEED]  a drive through a made-up town, see `potclient town --help`""",
@@ -59,6 +62,7 @@ DATASET is found out by looking at it:
   potclient publish generated --limit 20
   potclient publish town:terraces:300m --every 5 --max-range 25 --hold-out 0.2
   potclient publish kitti/00 --poses poses_velo_icp.txt --max-range 25
+  potclient publish kitti/00 --odometry kiss-icp             no poses: odometry places the scans; it closes no loops
   potclient publish sim_structured --max-range 8 --hold-out 0.2
   potclient publish aces.clf.bz2 --poses aces_poses_optimised.txt --every 10 --rate 20
   potclient publish scans/ --robot r2 --rate 10 --drop     like a live robot: newest cloud wins""",

@@ -16,8 +16,8 @@ import numpy as np
 
 from potclient.arrays import Float64
 from potclient.client import MapClient
-from potclient.commands.output_files import text_file
-from potclient.datasets import FORMATS, FRAMES, Recording, open_dataset
+from potclient.commands.output_files import output_file, text_file
+from potclient.datasets import FORMATS, FRAMES, LAYOUTS, ODOMETRIES, Recording, open_dataset
 from potclient.errors import UsageError
 from potclient.feed import FeedOptions
 from potclient.session import add_zenoh_arguments, options_from_arguments
@@ -106,9 +106,17 @@ def add_recording_arguments(parser: argparse.ArgumentParser, name: str) -> None:
     parser.add_argument("dataset", metavar=name)
     group = parser.add_argument_group("recording")
     group.add_argument("--format", choices=FORMATS, default="auto", help="default: look at it")
-    group.add_argument("--poses", metavar="FILE", help="pose file to use instead of the usual one")
     group.add_argument(
-        "--frame", choices=FRAMES, default="auto", help="PCD files without poses.txt: where their points are"
+        "--poses",
+        metavar="FILE",
+        help="pose file to use instead of the usual one: KITTI, TUM, or a graph's vertices",
+    )
+    _add_placing(group)
+    group.add_argument(
+        "--frame",
+        choices=FRAMES,
+        default="auto",
+        help="files of points: where their points are (default auto)",
     )
     group.add_argument(
         "--world-frame", action="store_const", const="world", dest="frame", help="the same as --frame world"
@@ -133,6 +141,42 @@ def add_recording_arguments(parser: argparse.ArgumentParser, name: str) -> None:
     group.add_argument("--limit", type=int, metavar="N", help="take at most N scans")
 
 
+def _add_placing(group: Any) -> None:
+    group.add_argument(
+        "--odometry",
+        choices=ODOMETRIES,
+        help="let LiDAR odometry place the scans of a folder without poses; it closes no loops",
+    )
+    group.add_argument(
+        "--trajectory",
+        type=output_file,
+        metavar="FILE",
+        help="write what odometry found, as TUM lines (default NAME.kiss-icp.tum in this folder)",
+    )
+    group.add_argument(
+        "--origin",
+        type=float,
+        nargs=3,
+        metavar=("X", "Y", "Z"),
+        help="where the sensor is in the frame of the points, m, for files in a vehicle's frame (default 0 0 0)",
+    )
+    group.add_argument(
+        "--layout",
+        choices=("auto", *LAYOUTS),
+        default="auto",
+        help="what a point of .bin files is (default: look at the numbers)",
+    )
+
+
+def _trajectory_of(arguments: argparse.Namespace) -> Path | None:
+    if arguments.odometry is None:
+        if arguments.trajectory is not None:
+            raise UsageError("--trajectory is for --odometry")
+        return None
+    default = f"{Path(arguments.dataset).resolve().name}.{arguments.odometry}.tum"
+    return arguments.trajectory or output_file(default)
+
+
 def open_recording(arguments: argparse.Namespace) -> Recording:
     """The scans that the recording's flags choose.
 
@@ -147,6 +191,10 @@ def open_recording(arguments: argparse.Namespace) -> Recording:
         arguments.format,
         poses=arguments.poses,
         frame=arguments.frame,
+        origin=arguments.origin,
+        layout=arguments.layout,
+        odometry=arguments.odometry,
+        trajectory=_trajectory_of(arguments),
         no_return_m=arguments.no_return,
         min_range_m=arguments.min_range,
         max_range_m=arguments.max_range,

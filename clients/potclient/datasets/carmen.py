@@ -53,7 +53,7 @@ class CarmenLog(Recording):
         self,
         path: Path,
         *,
-        poses: Path | None = None,
+        poses: str | Path | None = None,
         no_return_m: float = DEFAULT_NO_RETURN_M,
         max_range_m: float = DEFAULT_MAX_RANGE_M,
     ) -> None:
@@ -62,10 +62,12 @@ class CarmenLog(Recording):
         self._no_return_m, self._max_range_m = no_return_m, max_range_m
         n = len(self._lines)
         self._xyt = np.array([[line.x_m, line.y_m, line.yaw_rad] for line in self._lines])
-        note = "poses from the log's laser lines"
+        notes = ["poses from the log's laser lines", *_alternatives(path.parent, n)]
+        self._used = [path]
         if poses is not None:
-            file = path.parent / poses if (path.parent / poses).is_file() else poses
+            file = path.parent / poses if (path.parent / poses).is_file() else Path(poses)
             table = read_table(file, "poses")
+            self._used.append(file)
             if table.shape[1] not in (3, 5) or len(table) != n:
                 raise DatasetError(
                     f"poses: {file} has {len(table)} lines of {table.shape[1]} numbers, need {n} of `x y yaw` or"
@@ -74,12 +76,19 @@ class CarmenLog(Recording):
             if not np.isfinite(table[:, -3:]).all():
                 raise DatasetError(f"poses: {file} has a pose that is not finite")
             self._xyt = table[:, -3:]
-            note = f"poses from {file.name}"
-        self.notes = (note, f"no echo from {no_return_m:g} m on; beams free up to {max_range_m:g} m at most")
+            notes = [f"poses from {file.name}"]
+        self.notes = (
+            *notes,
+            f"no echo from {no_return_m:g} m on; beams free up to {max_range_m:g} m at most",
+        )
         self._stamps = growing([line.stamp_ns for line in self._lines])
 
     def __len__(self) -> int:
         return len(self._lines)
+
+    @property
+    def used(self) -> frozenset[Path]:
+        return frozenset(self._used)
 
     def read(self, i: int) -> RecordedScan:
         line = self._lines[i]
@@ -106,6 +115,19 @@ def is_carmen_name(path: Path) -> bool:
     if suffixes and suffixes[-1] in (".bz2", ".gz"):
         suffixes.pop()
     return bool(suffixes) and suffixes[-1] in SUFFIXES
+
+
+def _alternatives(folder: Path, n_lines: int) -> list[str]:
+    """Notes on files beside a log that hold a pose for each of its lines: often better ones than the log's odometry."""
+    notes = []
+    for file in sorted(folder.glob("*.txt")):
+        try:
+            fits = read_table(file, "poses").shape in ((n_lines, 3), (n_lines, 5))
+        except DatasetError:
+            continue  # no table: that is what was asked
+        if fits:
+            notes.append(f"{file.name} also holds a pose for each of its lines: --poses {file.name}")
+    return notes
 
 
 def _read_lines(path: Path) -> list[_Line]:

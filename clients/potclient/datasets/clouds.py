@@ -1,84 +1,92 @@
-"""Folders of PCD or PLY files, with poses.txt beside them or a VIEWPOINT in each header."""
+"""Folders of files of points, with a pose file beside them, a VIEWPOINT in each PCD header, or no poses for one scan alone."""
 
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from potclient.arrays import Bool, Float64, Floats
-from potclient.datasets.scans import RecordedScan, Recording, natural_key, read_poses, read_stamps
+from potclient.arrays import Float64, Floats
+from potclient.datasets.files import AUTO_LAYOUT, kind_of, read_beams, read_viewpoint
+from potclient.datasets.files.arrays import cloud_name
+from potclient.datasets.scans import RecordedScan, Recording, natural_key, read_stamps, stamps_of_names
+from potclient.datasets.trajectory import POSE_FILES, find_poses, other_poses, place_scans
 from potclient.errors import DatasetError
-from potclient.poses import quaternion_rotation
 
 RECORDING_FILE = "recording.json"
 FRAMES = ("auto", "sensor", "world")
+TIMES_FILE = "times.txt"
 
 
 class CloudFolder(Recording):
-    """A folder of .pcd or .ply files in natural order (scan_2 before scan_10), or a single file.
+    """A folder of files of points of one kind in natural order (scan_2 before scan_10), or a single file.
+
+    Stamps come from `times.txt` (seconds a line), or from the names of the files where all are times. `recording.json` with
+    `"is_planar": true` says that a 2D scanner took the scans (z = 0). Where the files have a field `is_return`, points with 0
+    there are beams without an echo, free up to the point.
 
     Args:
-        path: The folder or file. `poses.txt` in it gives T_map_sensor a line; `times.txt` seconds a line; `recording.json`
-            with `"is_planar": true` says that a 2D scanner took the scans (z = 0). Where the files have a field `is_return`,
-            points with 0 there are beams without an echo, free up to the point.
-        poses: Another pose file; relative names are looked up in the folder first.
-        frame: Where the points are. "sensor": sensor frame. "world": the map frame already, and the header's VIEWPOINT is only
-            the place of the sensor. "auto": sensor if there are poses, else world if a VIEWPOINT is not the origin.
+        path: The folder or file; see `potclient.datasets.files` for the kinds. Files may lie in folders in the folder.
+        poses: Pose file to use instead of one of `POSE_FILES`; relative names are looked up in the folder first.
+        frame: Where the points are. "sensor": sensor frame. "world": the map frame already, and poses say only where the sensor
+            was. "auto": sensor if there are poses, else world if a VIEWPOINT is not the origin.
+        origin: (3,) m, where the beams begin in the frame of the points, for files in a vehicle's frame; default (0, 0, 0).
+        layout: Of binary files, see `potclient.datasets.files.binary`.
+        needs_poses: False: somebody else places the scans, which all come with the pose of the origin.
     Raises:
         DatasetError: something is missing or does not fit together.
     """
 
     format = "clouds"
 
-    def __init__(self, path: Path, *, poses: Path | None = None, frame: str = "auto") -> None:
+    def __init__(
+        self,
+        path: Path,
+        *,
+        poses: str | Path | None = None,
+        frame: str = "auto",
+        origin: Sequence[float] | None = None,
+        layout: str = AUTO_LAYOUT,
+        needs_poses: bool = True,
+    ) -> None:
         super().__init__(path)
         if frame not in FRAMES:
             raise DatasetError(f"frame {frame!r}: need one of {', '.join(FRAMES)}")
-        folder = path if path.is_dir() else path.parent
-        self._files = cloud_files(path) if path.is_dir() else [path]
-        if not self._files:
-            raise DatasetError(f"{path}: no .pcd or .ply files")
-        suffixes = {f.suffix.lower() for f in self._files}
-        if len(suffixes) > 1:
-            raise DatasetError(
-                f"{path}: holds {' and '.join(sorted(suffixes))} files; keep one kind in a folder"
-            )
-        n = len(self._files)
-        pose_file = _named(folder, poses) if poses is not None else folder / "poses.txt"
-        self._poses: Float64 | None = None
+        self._folder = path if path.is_dir() else path.parent
+        self._files = _one_kind(path) if path.is_dir() else [path]
+        self._layout, self._origin = layout, _origin(origin)
+        self._poses: Float64 | None = None  # None: each file's VIEWPOINT
         self._points_in_world = frame == "world"
-        if path.is_dir() and pose_file.is_file() and not self._points_in_world:
-            self._poses = read_poses(pose_file, n)
-            self.notes = (f"poses from {pose_file.name}",)
-        elif suffixes == {".pcd"}:
-            placed = any(np.any(read_viewpoint(f)[:3, 3] != 0) for f in (self._files[0], self._files[-1]))
-            if not placed and n > 1:
-                raise DatasetError(f"{path}: no poses.txt and no VIEWPOINT; name a pose file with --poses")
-            self._points_in_world = frame == "world" or (frame == "auto" and placed)
-            where = "map frame" if self._points_in_world else "sensor frame"
-            self.notes = (
-                f"no poses.txt: sensor at each VIEWPOINT, points taken as {where} (--frame changes that)",
+        times = self._folder / TIMES_FILE if path.is_dir() else None
+        stamps = None if times is not None and times.is_file() else stamps_of_names(self._files)
+        self._stamps = stamps or read_stamps(times, len(self._files))
+        self._used = [self._folder / TIMES_FILE, self._folder / RECORDING_FILE]
+        if needs_poses:
+            self._place(
+                poses, frame, stamps or (self._stamps if times is not None and times.is_file() else None)
             )
-        elif n == 1:
-            self._poses = np.eye(4)[None]
-            self.notes = ("no poses.txt: the one scan is at the origin",)
         else:
-            raise DatasetError(f"{path}: no poses.txt; name a pose file with --poses")
-        self._is_planar = path.is_dir() and _is_planar(folder / RECORDING_FILE)
-        self._stamps = read_stamps(folder / "times.txt" if path.is_dir() else None, n)
+            self._poses = np.tile(np.eye(4), (len(self._files), 1, 1))
+        self._is_planar = path.is_dir() and _is_planar(self._folder / RECORDING_FILE)
+        self.notes = (*self.notes, *self._layout_note())
 
     def __len__(self) -> int:
         return len(self._files)
 
+    @property
+    def used(self) -> frozenset[Path]:
+        return frozenset((*self._files, *self._used))
+
     def read(self, i: int) -> RecordedScan:
         file = self._files[i]
-        points, is_return = read_beams(file)
+        points, is_return, _ = read_beams(file, self._layout)
         pose = read_viewpoint(file) if self._poses is None else self._poses[i]
         if self._points_in_world:
             points = (points.astype(np.float64) - pose[:3, 3]) @ pose[:3, :3]
+        if self._origin is not None:
+            points, pose = moved_origin(points, pose, self._origin)
         points = points.astype(np.float32)  # only now: world coordinates need doubles
         finite = np.isfinite(points).all(axis=1)
         return RecordedScan(
@@ -86,34 +94,121 @@ class CloudFolder(Recording):
             is_return=is_return[finite],
             T_map_sensor=pose,
             stamp_ns=self._stamps[i],
-            name=file.name,
+            name=file.relative_to(self._folder).as_posix(),
             is_planar=self._is_planar,
         )
 
+    def _place(self, poses: str | Path | None, frame: str, stamps: list[int] | None) -> None:
+        """Find each file's pose, and drop the files that have none."""
+        n = len(self._files)
+        pose_file = find_poses(self._folder, poses) if self.path.is_dir() or poses is not None else None
+        has_viewpoints = kind_of(self._files[0]) == "PCD" and any(
+            np.any(read_viewpoint(f)[:3, 3] != 0) for f in (self._files[0], self._files[-1])
+        )
+        if pose_file is not None and not (frame == "world" and has_viewpoints and poses is None):
+            placed = place_scans(pose_file, n, stamps)
+            self._files = [self._files[i] for i in placed.scans]
+            self._stamps = placed.stamps_ns or [self._stamps[i] for i in placed.scans]
+            self._poses = placed.poses
+            self._used.append(pose_file)
+            self.notes = (placed.note, *(alternatives(self._folder, pose_file, n)))
+        elif has_viewpoints:
+            self._points_in_world = frame != "sensor"
+            where = "map frame" if self._points_in_world else "sensor frame"
+            self.notes = (
+                f"no poses.txt: sensor at each VIEWPOINT, points taken as {where} (--frame changes that)",
+            )
+        elif n == 1:
+            self._poses = np.eye(4)[None]
+            self.notes = ("no poses: the one scan is at the origin",)
+        else:
+            raise DatasetError(without_poses(self.path, self._files))
+
+    def _layout_note(self) -> tuple[str, ...]:
+        if kind_of(self._files[0]) not in ("binary", "nuScenes"):
+            return ()
+        return (read_beams(self._files[0], self._layout).layout,)
+
+
+def moved_origin(points: Floats, pose: Float64, origin: Float64) -> tuple[Floats, Float64]:
+    """Points and pose of a frame that begins at the origin of the beams, (3,) m, given in the frame of the points."""
+    moved = pose.copy()
+    moved[:3, 3] = pose[:3, :3] @ origin + pose[:3, 3]
+    return points.astype(np.float64) - origin, moved
+
 
 def cloud_files(folder: Path) -> list[Path]:
-    """The .pcd and .ply files of a folder, in natural order."""
-    return sorted((f for f in folder.iterdir() if f.suffix.lower() in (".pcd", ".ply")), key=natural_key)
+    """The files of points in a folder, or in its folders if it has none itself, in natural order.
 
-
-def read_cloud(path: Path) -> Floats:
-    """(N, 3) m: x, y, z of a PCD (ascii, binary, compressed) or PLY file; NaN where the file says so.
-
-    float32, or float64 where the file has numbers that float32 cannot hold.
-
-    Raises:
-        DatasetError: not such a file, truncated, or without x y z.
+    An .npz that holds no cloud is none.
     """
-    return read_beams(path)[0]
+    here = [f for f in folder.iterdir() if kind_of(f) is not None and f.is_file()]
+    found = here or [f for f in folder.rglob("*") if kind_of(f) is not None and f.is_file()]
+    clouds = [f for f in found if kind_of(f) != "npz" or _holds_cloud(f)]
+    return sorted(clouds, key=lambda f: [natural_key(Path(part)) for part in f.relative_to(folder).parts])
 
 
-def read_beams(path: Path) -> tuple[Floats, Bool]:
-    """(N, 3) m and (N,): the points of a file as `read_cloud`, and whether each is an echo (all are, without `is_return`).
+def without_poses(path: Path, files: Sequence[Path]) -> str:
+    """What is missing to play clouds that nobody placed, and the commands that would work."""
+    lines = [
+        f"{path}: {len(files)} clouds ({files[0].name}, ...) and no poses: none of {', '.join(POSE_FILES)}"
+    ]
+    for name, found in other_poses(path):
+        fits = "fits" if len(found.poses) == len(files) else f"does not fit {len(files)} scans"
+        lines.append(f"{name} holds {_said_poses(len(found.poses), found.form)} and {fits}")
+    lines.append(
+        "name a pose file (KITTI rows of 12 numbers, TUM, or a graph's vertices) with --poses FILE, or let odometry place the"
+        f" scans: potclient publish {path} --odometry kiss-icp, or play one scan alone: potclient publish {files[0]}"
+    )
+    return "; ".join(lines)
 
-    Raises:
-        DatasetError: as `read_cloud`.
-    """
-    return _read_pcd(path) if path.suffix.lower() == ".pcd" else _read_ply(path)
+
+def alternatives(folder: Path, taken: Path, n_scans: int) -> list[str]:
+    """Notes on pose files that would fit too and were not taken."""
+    return [
+        f"{name} also holds {_said_poses(n_scans, found.form)}: --poses {name}"
+        for name, found in other_poses(folder, taken)
+        if len(found.poses) == n_scans
+    ]
+
+
+def _said_poses(n: int, form: str) -> str:
+    return f"{n} pose{'s' if n != 1 else ''} ({form})"
+
+
+def _one_kind(folder: Path) -> list[Path]:
+    files = cloud_files(folder)
+    if not files:
+        raise DatasetError(f"{folder}: no files of points in it")
+    kinds: dict[str, list[Path]] = {}
+    for file in files:
+        kinds.setdefault(str(kind_of(file)), []).append(file)
+    if len(kinds) > 1:
+        there = ", ".join(
+            f"{len(of)} {kind} ({', '.join(f.name for f in of[:2])}{', ...' if len(of) > 2 else ''})"
+            for kind, of in sorted(kinds.items())
+        )
+        raise DatasetError(
+            f"{folder}: holds {there}; keep one kind in a folder, or name a file: potclient publish {files[0]}"
+        )
+    return files
+
+
+def _holds_cloud(path: Path) -> bool:
+    try:
+        with np.load(path, allow_pickle=False) as arrays:
+            return cloud_name(arrays) is not None
+    except (OSError, ValueError, EOFError):
+        return True  # reading it says what is wrong with it
+
+
+def _origin(origin: Sequence[float] | None) -> Float64 | None:
+    if origin is None:
+        return None
+    place = np.asarray(origin, np.float64)
+    if place.shape != (3,) or not np.isfinite(place).all():
+        raise DatasetError(f"origin {origin}: need x y z in metres")
+    return place
 
 
 def _is_planar(path: Path) -> bool:
@@ -126,84 +221,3 @@ def _is_planar(path: Path) -> bool:
     if not isinstance(is_planar, bool):
         raise DatasetError(f"{path}: is_planar must be true or false, not {is_planar!r}")
     return is_planar
-
-
-def _read_pcd(path: Path) -> tuple[Floats, Bool]:
-    try:
-        from pypcd4 import PointCloud
-    except ImportError as error:
-        raise DatasetError(f"{path}: reading PCD needs the package pypcd4: pip install pypcd4") from error
-    try:
-        cloud = PointCloud.from_path(path)
-    except OSError as error:
-        raise DatasetError(f"{path}: cannot be read ({error.strerror or error})") from error
-    except Exception as error:  # pypcd4 raises whatever its parsers raise
-        raise DatasetError(f"{path}: not a readable PCD file ({_short(error)})") from error
-    data = np.atleast_1d(cloud.pc_data)
-    if len(data) != cloud.metadata.points:
-        raise DatasetError(f"{path}: truncated, {len(data)} of {cloud.metadata.points} points")
-    return _beams(path, data, tuple(data.dtype.names or ()))
-
-
-def _read_ply(path: Path) -> tuple[Floats, Bool]:
-    try:
-        from plyfile import PlyData
-    except ImportError as error:
-        raise DatasetError(f"{path}: reading PLY needs the package plyfile: pip install plyfile") from error
-    try:
-        data = PlyData.read(str(path))["vertex"].data  # mapped: 50 times faster than reading rows
-    except OSError as error:
-        raise DatasetError(f"{path}: cannot be read ({error.strerror or error})") from error
-    except Exception as error:  # plyfile raises whatever its parsers raise
-        raise DatasetError(f"{path}: not a readable PLY file with vertices ({_short(error)})") from error
-    return _beams(path, data, tuple(data.dtype.names or ()))
-
-
-def _beams(path: Path, data: Any, names: tuple[str, ...]) -> tuple[Floats, Bool]:
-    if not {"x", "y", "z"} <= set(names):
-        raise DatasetError(f"{path}: fields {' '.join(names)}, need x y z")
-    dtype = np.result_type(np.float32, *(data[axis].dtype for axis in "xyz"))
-    points = np.stack([np.asarray(data[axis], dtype) for axis in "xyz"], axis=1)
-    if "is_return" not in names:
-        return points, np.ones(len(points), np.bool_)
-    return points, np.asarray(data["is_return"]) != 0
-
-
-def read_viewpoint(path: Path) -> Float64:
-    """(4, 4): the VIEWPOINT of a PCD header (tx ty tz qw qx qy qz); identity if there is none.
-
-    Raises:
-        DatasetError: it is not seven numbers, or the quaternion is zero.
-    """
-    with path.open("rb") as file:
-        head = file.read(4096)
-    for line in head.split(b"\n"):
-        if line.startswith(b"DATA"):
-            break
-        if line.startswith(b"VIEWPOINT"):
-            try:
-                tx, ty, tz, w, x, y, z = (float(v) for v in line.split()[1:])
-            except ValueError as error:
-                raise DatasetError(
-                    f"{path}: VIEWPOINT must be seven numbers, tx ty tz qw qx qy qz"
-                ) from error
-            norm = float(np.sqrt(w * w + x * x + y * y + z * z))
-            if not norm > 0:
-                raise DatasetError(f"{path}: VIEWPOINT has a quaternion of length {norm}")
-            pose = np.eye(4)
-            pose[:3, :3] = quaternion_rotation(w / norm, x / norm, y / norm, z / norm)
-            pose[:3, 3] = tx, ty, tz
-            return pose
-    return np.eye(4)
-
-
-def _named(folder: Path, poses: Path) -> Path:
-    for candidate in (folder / poses, poses):
-        if candidate.is_file():
-            return candidate
-    raise DatasetError(f"poses: no file {poses} in {folder} or here")
-
-
-def _short(error: Exception) -> str:
-    lines = str(error).strip().splitlines()
-    return lines[0] if lines else type(error).__name__

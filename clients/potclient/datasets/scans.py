@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import re
 from abc import abstractmethod
 from collections.abc import Iterator, Sequence
@@ -15,6 +16,7 @@ from potclient.arrays import Bool, Float32, Float64
 from potclient.errors import DatasetError
 
 _MAX_STAMP_S = 2.0**63 / 1e9
+_NS_PER_DIGITS = {13: 10**6, 16: 10**3, 18: 1, 19: 1}  # how long a stamp is in ms, us, ns
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -58,6 +60,11 @@ class Recording(Sequence[RecordedScan]):
 
     @abstractmethod
     def __len__(self) -> int: ...
+
+    @property
+    def used(self) -> frozenset[Path]:
+        """The files that it reads, where it can tell."""
+        return frozenset()
 
     @abstractmethod
     def read(self, i: int) -> RecordedScan:
@@ -160,32 +167,25 @@ def read_table(path: Path, what: str) -> Float64:
     return table
 
 
-def read_poses(path: Path, n_scans: int) -> Float64:
-    """(n_scans, 4, 4): one pose a line, 12 numbers (the top three rows of the matrix) or 16.
+def stamps_of_names(files: Sequence[Path]) -> list[int] | None:
+    """Stamps, ns, from files that are called by their times; None unless all are, and in growing order.
 
-    Raises:
-        DatasetError: another number of columns or lines, or a matrix that is not rigid.
+    A time is the last number in the name: 13 digits of ms, 16 of us, 18 or 19 of ns, or ten of seconds, a point and decimals.
     """
-    table = read_table(path, "poses")
-    if table.shape[1] not in (12, 16):
-        raise DatasetError(
-            f"poses: {path} has {table.shape[1]} numbers a line, need 12 (3x4) or 16 (4x4), row-major"
-        )
-    if len(table) != n_scans:
-        raise DatasetError(f"poses: {path} has {len(table)} lines for {n_scans} scans")
-    poses = np.tile(np.eye(4), (n_scans, 1, 1))
-    poses[:, :3] = table[:, :12].reshape(-1, 3, 4)
-    rotations = poses[:, :3, :3]
-    defect = np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
-    if not (defect < 1e-2).all():
-        line = int(np.argmax(~(defect < 1e-2))) + 1
-        raise DatasetError(
-            f"poses: {path} line {line} is not a rotation and a translation (off by {defect[line - 1]:.2g})"
-        )
-    if not np.isfinite(poses).all():
-        line = int(np.argmax(~np.isfinite(poses).all(axis=(1, 2)))) + 1
-        raise DatasetError(f"poses: {path} line {line} has a translation that is not finite")
-    return poses
+    stamps = [_stamp_of_name(file.name) for file in files]
+    found = [stamp for stamp in stamps if stamp is not None]
+    is_growing = all(a < b for a, b in itertools.pairwise(found))
+    return found if found and len(found) == len(stamps) and is_growing else None
+
+
+def _stamp_of_name(name: str) -> int | None:
+    seconds = re.findall(r"(?<!\d)(\d{10})[._](\d{3,9})(?!\d)", name)
+    if seconds:
+        whole, decimals = seconds[-1]
+        return int(whole) * 10**9 + int(decimals.ljust(9, "0"))
+    numbers: list[str] = re.findall(r"\d+", name)
+    long = [digits for digits in numbers if len(digits) in _NS_PER_DIGITS]
+    return int(long[-1]) * _NS_PER_DIGITS[len(long[-1])] if long else None
 
 
 def read_stamps(path: Path | None, n_scans: int, *, period_s: float = 0.1) -> list[int]:

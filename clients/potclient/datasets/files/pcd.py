@@ -1,0 +1,62 @@
+"""PCD files: ascii, binary and compressed, by pypcd4."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from potclient.arrays import Float64
+from potclient.datasets.files.beams import Beams, beams_of_columns, short
+from potclient.errors import DatasetError
+from potclient.poses import quaternion_rotation
+
+
+def read_pcd(path: Path) -> Beams:
+    """The points of a PCD file.
+
+    Raises:
+        DatasetError: not such a file, truncated, or without x y z.
+    """
+    try:
+        from pypcd4 import PointCloud
+    except ImportError as error:
+        raise DatasetError(f"{path}: reading PCD needs the package pypcd4: pip install pypcd4") from error
+    try:
+        cloud = PointCloud.from_path(path)
+    except OSError as error:
+        raise DatasetError(f"{path}: cannot be read ({error.strerror or error})") from error
+    except Exception as error:  # pypcd4 raises whatever its parsers raise
+        raise DatasetError(f"{path}: not a readable PCD file ({short(error)})") from error
+    data = np.atleast_1d(cloud.pc_data)
+    if len(data) != cloud.metadata.points:
+        raise DatasetError(f"{path}: truncated, {len(data)} of {cloud.metadata.points} points")
+    return beams_of_columns(path, data, tuple(data.dtype.names or ()))
+
+
+def read_viewpoint(path: Path) -> Float64:
+    """(4, 4): the VIEWPOINT of a PCD header (tx ty tz qw qx qy qz); identity if there is none.
+
+    Raises:
+        DatasetError: it is not seven numbers, or the quaternion is zero.
+    """
+    with path.open("rb") as file:
+        head = file.read(4096)
+    for line in head.split(b"\n"):
+        if line.startswith(b"DATA"):
+            break
+        if line.startswith(b"VIEWPOINT"):
+            try:
+                tx, ty, tz, w, x, y, z = (float(v) for v in line.split()[1:])
+            except ValueError as error:
+                raise DatasetError(
+                    f"{path}: VIEWPOINT must be seven numbers, tx ty tz qw qx qy qz"
+                ) from error
+            norm = float(np.sqrt(w * w + x * x + y * y + z * z))
+            if not norm > 0:
+                raise DatasetError(f"{path}: VIEWPOINT has a quaternion of length {norm}")
+            pose = np.eye(4)
+            pose[:3, :3] = quaternion_rotation(w / norm, x / norm, y / norm, z / norm)
+            pose[:3, 3] = tx, ty, tz
+            return pose
+    return np.eye(4)

@@ -1,0 +1,1 @@
+"""A map in 3D, in Rerun: live, or as a recording that Rerun opens later."""
