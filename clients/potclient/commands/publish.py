@@ -53,6 +53,7 @@ DATASET is found out by looking at it:
   a folder with velodyne/*.bin      KITTI odometry, with poses.txt and calib.txt
   a folder of .pcd or .ply files    with poses.txt (3x4 a line), or a VIEWPOINT in each header
   a .log or .clf file (.bz2, .gz)   a CARMEN log of a planar laser
+  a .mcap, .db3 or .bag file        PointCloud2 or LaserScan with /tf, or --poses TOPIC; also a rosbag2 folder
   generated[:2d][:SEED]             a made-up yard
   town:STYLE[:2d][:dynamic][:SEED]  a drive through a made-up town, see `potclient town --help`""",
         epilog="""examples:
@@ -61,6 +62,7 @@ DATASET is found out by looking at it:
   potclient publish kitti/00 --poses poses_velo_icp.txt --max-range 25
   potclient publish sim_structured --max-range 8 --hold-out 0.2
   potclient publish aces.clf.bz2 --poses aces_poses_optimised.txt --every 10 --rate 20
+  potclient publish drive.mcap --topic /points --tf
   potclient publish scans/ --robot r2 --rate 10 --drop     like a live robot: newest cloud wins""",
     )
     add_recording_arguments(parser, "DATASET")

@@ -3,13 +3,14 @@
 Formats: `kitti` (odometry layout), `clouds` (a folder of PCD or PLY files with poses), `carmen` (2D laser logs), `generated`
 (a made-up yard; the path is `generated`, `generated:2d`, or either with `:SEED`), `town` (a drive through a made-up town, see
 `potclient.towns`; the path is `town:STYLE[:2d][:dynamic][:SENSOR][:LENGTHm][:SEED]`), `gauntlet` (doorways, poles and wires of
-known size; the path is `gauntlet[:SENSOR][:SEED]`).
+known size; the path is `gauntlet[:SENSOR][:SEED]`), `bag` (MCAP, rosbag2 and ROS 1 bags, see `potclient.datasets.bags`).
 """
 
 from __future__ import annotations
 
 from pathlib import Path
 
+from potclient.datasets.bags import is_bag, open_bag
 from potclient.datasets.carmen import DEFAULT_MAX_RANGE_M, DEFAULT_NO_RETURN_M, CarmenLog, is_carmen_name
 from potclient.datasets.clouds import FRAMES, CloudFolder, cloud_files
 from potclient.datasets.generated import GeneratedRecording, GeneratedScene
@@ -27,7 +28,7 @@ __all__ = [
     "open_dataset",
 ]
 
-FORMATS = ("auto", "kitti", "clouds", "carmen", "generated", "town", "gauntlet")
+FORMATS = ("auto", "kitti", "clouds", "carmen", "generated", "town", "gauntlet", "bag")
 
 
 def open_dataset(
@@ -47,7 +48,7 @@ def open_dataset(
         path: A folder or file, `generated[:2d][:SEED]`, `town:STYLE[:2d][:dynamic][:SENSOR][:LENGTHm][:SEED]`, or
             `gauntlet[:SENSOR][:SEED]`.
         format: One of `FORMATS`; "auto" looks at what is there.
-        poses: Pose file to use instead of the usual one.
+        poses: Pose file to use instead of the usual one; for bags the topic of the poses.
         frame: For PCD files: where their points are, see `CloudFolder`.
         no_return_m: For CARMEN logs: readings from here on are no echoes (default 50).
         min_range_m: Points nearer than this are dropped.
@@ -79,6 +80,9 @@ def open_dataset(
         raise DatasetError(f"{path}: no such file or folder")
     if format == "auto":
         format, path = _sniff(path)  # noqa: A001
+    if format == "bag":
+        topic = None if poses is None else str(poses)
+        return open_bag(path, poses=topic, min_range_m=min_range_m, max_range_m=max_range_m)
     if format == "kitti":
         return _limited(KittiRecording(path, poses=pose_file), min_range_m, max_range_m)
     if format == "clouds":
@@ -98,6 +102,8 @@ def _limited(recording: Recording, min_range_m: float, max_range_m: float | None
 
 def _sniff(path: Path) -> tuple[str, Path]:
     """The format of a path, and the path to open it at."""
+    if is_bag(path):
+        return "bag", path
     if path.is_file():
         if path.suffix.lower() in (".pcd", ".ply"):
             return "clouds", path
