@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from potclient.commands.parsers import CommandParser
 from potclient.errors import DatasetError, UsageError
 from potschemas import __version__
-from potserver.commands import atoms, config, demo, maps, serve
+from potserver.commands import atoms, config, demo, maps, ros, serve
 from potserver.commands import eval as evaluation
 from potserver.commands.shared import EXIT_OK, EXIT_USAGE, Formatter, say
 from potserver.errors import PotserverError
@@ -47,7 +47,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"potserver {__version__}")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND")
-    for verb in (serve, config, atoms, maps, evaluation, demo):
+    for verb in (serve, ros, config, atoms, maps, evaluation, demo):
         verb.add(commands)
     return parser
 

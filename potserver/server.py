@@ -19,6 +19,7 @@ from types import TracebackType
 
 import zenoh
 
+from potclient.client import MapClient
 from potschemas import __version__, keys
 from potserver.adapters.presence import OtherServers
 from potserver.adapters.query_pool import QueryPool
@@ -34,6 +35,7 @@ from potserver.log import get_logger
 from potserver.mapping.service import MappingService
 from potserver.node import FLUSH_S, QUEUE_MESSAGES, MapNode, Shared
 from potserver.numerics.threads import default_threads
+from potserver.ros.bridge import Bridge
 from potserver.storage.map_store import MapStore, MemoryOnly
 
 log = get_logger("potserver.server")
@@ -74,6 +76,7 @@ class MapServer:
         self.pool: QueryPool | None = None
         self._stats: StatsPublisher | None = None
         self._stores: dict[str, MapStore] = {}
+        self._ros: tuple[Bridge, MapClient] | None = None
         self._stopping = threading.Event()
         self._lock = threading.Lock()  # start and stop, one at a time
         self._stopped_clean: bool | None = None
@@ -194,6 +197,9 @@ class MapServer:
         )
         for node in self.nodes.values():
             node.announce(s.server_id)
+        if s.ros.clouds:
+            client = MapClient(map=s.ros.map or s.maps[0], root=s.root, session=session)
+            self._ros = Bridge(session, client, s.ros, self.health), client
 
     def _encode_stats(self) -> Wire:
         nodes = list(self.nodes.values())
@@ -229,6 +235,16 @@ class MapServer:
         self._stores[mapper.map_id] = store
         return store.restore(mapper).stamps
 
+    def _close_ros(self) -> bool:
+        """Take no more clouds from ROS, and withdraw our topics; those on their way to a map count as unknown."""
+        ros, self._ros = self._ros, None
+        if ros is None:
+            return True
+        bridge, client = ros
+        ended = bridge.close()
+        client.close()
+        return ended
+
     def _close_stores(self) -> bool:
         stores, self._stores = self._stores, {}
         closed = [store.close() for store in stores.values()]  # all of them, whatever the first says
@@ -243,6 +259,7 @@ class MapServer:
         log.info(
             "server_draining", clouds=sum(node.intake.depth for node in nodes), timeout_s=drain_timeout_s
         )
+        ros_ended = self._close_ros()
         deadline = time.monotonic() + drain_timeout_s
         for node in nodes:
             node.withdraw()
@@ -253,7 +270,7 @@ class MapServer:
             self._stats.close()
         ended = [node.close() for node in nodes]
         kept = self._close_stores()  # after the writers: a last snapshot of what they made
-        clean = all([*drained, answered, *ended, kept, close_session(session, _CLOSE_S)])
+        clean = all([ros_ended, *drained, answered, *ended, kept, close_session(session, _CLOSE_S)])
         self._session = None
         log.info("server_stopped", clean=clean, counters=self.health.counters())
         return clean

@@ -43,6 +43,8 @@ examples:
   potserver serve --store /var/lib/site/maps             keep the maps there; --in-memory: forget them at the end
   potserver serve --connect tcp/router:7447 --listen tcp/127.0.0.1:7448
                                                          join a Zenoh router (ROS 2 hosts have one on 7447)
+  potserver serve --connect tcp/127.0.0.1:7447 --listen tcp/127.0.0.1:7448 --ros /points
+                                                         map the PointCloud2 of ROS 2, publish its OccupancyGrid
   potserver serve --settings site.toml --set limits.max_cloud_points=100000
   POTSERVER_MAPS=ground,roof potserver serve             every setting is also a variable
 
@@ -55,6 +57,12 @@ def add(commands: Any) -> None:
         commands, "serve", _run, help="serve maps until a signal comes", description=_ABOUT, epilog=_EXAMPLES
     )
     add_settings_flags(parser)
+    parser.add_argument(
+        "--ros",
+        action="append",
+        metavar="TOPIC",
+        help="ROS 2 clouds to map, e.g. /points; repeatable; the map goes out as ROS 2 topics (docs/ros.md)",
+    )
 
 
 def _run(options: argparse.Namespace) -> int:

@@ -6,9 +6,42 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
+# as they stand in the packages map_msgs and octomap_msgs, which rosbags does not bring
+STORE.register(
+    get_types_from_msg(
+        """std_msgs/Header header
+int32 x
+int32 y
+uint32 width
+uint32 height
+int8[] data
+""",
+        "map_msgs/msg/OccupancyGridUpdate",
+    )
+)
+STORE.register(
+    get_types_from_msg(
+        """# A 3D map in binary format, as Octree
+std_msgs/Header header
+
+# Flag to denote a binary (only free/occupied) or full occupancy octree (.bt/.ot file)
+bool binary
+
+# Class id of the contained octree
+string id
+
+# Resolution (in m) of the smallest octree nodes
+float64 resolution
+
+# binary serialization of octree, use conversions.h to read and write octrees
+int8[] data
+""",
+        "octomap_msgs/msg/Octomap",
+    )
+)
 
 
 def make(type_name: str, **fields: Any) -> Any:

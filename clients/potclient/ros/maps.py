@@ -15,7 +15,7 @@ from potclient.ros.types import OCCUPANCY_GRID, OCCUPANCY_GRID_UPDATE, OCTOMAP, 
 Int8 = NDArray[np.int8]
 
 UNKNOWN = -1  # the value of an `OccupancyGrid`'s cell where nothing was observed
-_SD_OF_YELLOW = 0.25  # sd of the probability from which on the colour stays: half of the largest there is
+_SD_OF_YELLOW = 0.5  # sd of the probability: the largest there is
 
 
 def grid_values(mean: Float32, observed: Bool) -> Int8:

@@ -1,0 +1,88 @@
+"""RosTopic: a topic that we publish, as rmw_zenoh and as zenoh-bridge-ros2dds expect it."""
+
+from __future__ import annotations
+
+import contextlib
+import time
+import uuid
+from typing import Any
+
+import zenoh
+from zenoh import ext
+
+from potclient.link import is_matching
+from potclient.ros.types import encode
+from potserver.ros.names import attachment, node_token, publisher_token, topic_key
+
+
+class RosNode:
+    """Our node in the ROS graph: it hands out topics, and is listed as long as it is open."""
+
+    def __init__(self, session: zenoh.Session, domain: int) -> None:
+        self._session, self._domain = session, domain
+        self._zid = str(session.info.zid())
+        self._n_entities = 0
+        self._token = session.liveliness().declare_token(node_token(domain, self._zid))
+
+    def topic(self, name: str, type_name: str, *, latched: bool) -> RosTopic:
+        """Declare a topic.
+
+        Args:
+            latched: Whoever subscribes later gets the last message (transient local).
+        """
+        self._n_entities += 1
+        token = publisher_token(self._domain, self._zid, self._n_entities, name, type_name, latched=latched)
+        keys = (topic_key(self._domain, name, type_name), name.lstrip("/"))
+        return RosTopic(self._session, keys, type_name, token)
+
+    def close(self) -> None:
+        """Leave the graph."""
+        self._token.undeclare()
+
+
+class RosTopic:
+    """One topic on two keys. Whoever asks the cache of either gets the last message.
+
+    Args:
+        keys: Of rmw_zenoh, and of zenoh-bridge-ros2dds.
+        token: Lists the publisher.
+    """
+
+    def __init__(self, session: zenoh.Session, keys: tuple[str, str], type_name: str, token: str) -> None:
+        self._type_name = type_name
+        self._gid = uuid.uuid4().bytes
+        self._sequence = 0
+        # an advanced publisher does not tell whether anybody listens, so a plain one beside it does
+        self._watches = [session.declare_publisher(key) for key in keys]
+        self._publishers = [
+            ext.declare_advanced_publisher(
+                session,
+                key,
+                congestion_control=zenoh.CongestionControl.BLOCK,
+                priority=zenoh.Priority.DATA_LOW,
+                cache=ext.CacheConfig(1),
+                publisher_detection=True,
+            )
+            for key in keys
+        ]
+        self._token = session.liveliness().declare_token(token)
+
+    @property
+    def has_listeners(self) -> bool:
+        """Somebody subscribes."""
+        return any(is_matching(watch) for watch in self._watches)
+
+    def put(self, message: Any) -> None:
+        """Publish a message of the topic's type."""
+        payload = encode(message, self._type_name)
+        self._sequence += 1
+        beside = attachment(self._sequence, time.time_ns(), self._gid)
+        for publisher in self._publishers:
+            publisher.put(payload, attachment=beside)
+
+    def close(self) -> None:
+        """Withdraw the topic."""
+        declarations: list[Any] = [self._token, *self._publishers, *self._watches]
+        for declared in declarations:
+            with contextlib.suppress(zenoh.ZError):
+                declared.undeclare()
