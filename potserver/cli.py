@@ -7,7 +7,7 @@ import sys
 from collections.abc import Sequence
 
 from potclient.commands.parsers import CommandParser
-from potclient.errors import DatasetError, UsageError
+from potclient.errors import PotclientError
 from potschemas import __version__
 from potserver.commands import atoms, config, demo, maps, ros, serve
 from potserver.commands import eval as evaluation
@@ -33,7 +33,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             parser.print_help()
             return EXIT_USAGE
         return int(options.run(options))
-    except (PotserverError, DatasetError, UsageError) as error:
+    except (PotserverError, PotclientError) as error:
         say(f"potserver: {error}", sys.stderr)
         return EXIT_USAGE
     except BrokenPipeError:  # `potserver config show | head`

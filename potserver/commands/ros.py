@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import dataclasses
 from typing import Any
 
 from potserver.commands.shared import EXIT_OK, EXIT_UNCLEAN, add_verb, settings_of
@@ -54,7 +55,7 @@ def _run(options: argparse.Namespace) -> int:
     import zenoh
 
     from potclient.client import MapClient
-    from potclient.session import open_session, options_from_arguments
+    from potclient.session import SessionOptions, open_session, options_from_arguments
     from potserver.commands.serve import StopSignals
     from potserver.health import Health
     from potserver.log import configure_logging, get_logger
@@ -66,11 +67,18 @@ def _run(options: argparse.Namespace) -> int:
     zenoh.try_init_log_from_env()  # RUST_LOG
     log, health = get_logger("potserver.cli"), Health()
     with StopSignals.installed() as stop, contextlib.ExitStack() as stack:
-        session = stack.enter_context(open_session(options_from_arguments(options)))
+        network = options_from_arguments(options)
+        # latched topics count by time
+        network = dataclasses.replace(
+            network, overrides=(*network.overrides, ("timestamping/enabled", "true"))
+        )
+        session = stack.enter_context(open_session(network))
         client = MapClient(
-            options.server,
             map=options.map,
             root=settings.root,
+            options=SessionOptions(connect=(options.server,), connect_timeout_s=options.wait)
+            if options.server
+            else None,
             session=None if options.server else session,
         )
         stack.callback(client.close)

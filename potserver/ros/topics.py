@@ -10,8 +10,10 @@ from typing import Any
 import zenoh
 from zenoh import ext
 
+from potclient.errors import UsageError
 from potclient.link import is_matching
 from potclient.ros.types import encode
+from potclient.zenoh_config import reason_of
 from potserver.ros.names import attachment, node_token, publisher_token, topic_key
 
 
@@ -54,17 +56,10 @@ class RosTopic:
         self._sequence = 0
         # an advanced publisher does not tell whether anybody listens, so a plain one beside it does
         self._watches = [session.declare_publisher(key) for key in keys]
-        self._publishers = [
-            ext.declare_advanced_publisher(
-                session,
-                key,
-                congestion_control=zenoh.CongestionControl.BLOCK,
-                priority=zenoh.Priority.DATA_LOW,
-                cache=ext.CacheConfig(1),
-                publisher_detection=True,
-            )
-            for key in keys
-        ]
+        try:
+            self._publishers = [_latched(session, key) for key in keys]
+        except zenoh.ZError as error:  # a configuration of the user's own without time stamps
+            raise UsageError(f"Zenoh refuses the topic {keys[1]}: {reason_of(error)}") from error
         self._token = session.liveliness().declare_token(token)
 
     @property
@@ -86,3 +81,14 @@ class RosTopic:
         for declared in declarations:
             with contextlib.suppress(zenoh.ZError):
                 declared.undeclare()
+
+
+def _latched(session: zenoh.Session, key: str) -> ext.AdvancedPublisher:
+    return ext.declare_advanced_publisher(
+        session,
+        key,
+        congestion_control=zenoh.CongestionControl.BLOCK,
+        priority=zenoh.Priority.DATA_LOW,
+        cache=ext.CacheConfig(1),
+        publisher_detection=True,
+    )

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import json
 import math
-import socket
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -23,6 +22,7 @@ from tests.ros import messages as ros
 
 from .conftest import DEADLINE_S, MakeRig, Rig, until
 from .ros_strangers import Stranger
+from .scripted import free_port
 
 S = 10**9
 T0 = 1_700_000_000 * S
@@ -59,12 +59,6 @@ def dropped(rig: Rig, reason: str, n: int = 1) -> None:
 
 def cloud(stamp_ns: int, frame: str = "lidar") -> Any:
     return ros.cloud(ros.xyz_rows(POINTS), frame, stamp_ns)
-
-
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 class BridgedDds:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,7 @@ from typing import Any
 import numpy as np
 from rosbags.rosbag2 import StoragePlugin, Writer
 
-from potclient.datasets import Recording
+from potclient.datasets import RecordedScan, Recording
 from tests.ros import messages as ros
 
 Put = Callable[[str, Any, int], None]  # (topic, message, when it is logged, ns)
@@ -32,6 +33,24 @@ def writing(folder: Path, plugin: StoragePlugin = StoragePlugin.MCAP) -> Iterato
             writer.write(connections[topic], logged_ns, ros.cdr(message, kind))
 
         yield put
+
+
+class EchoesOnly(Recording):
+    """A recording without its beams that have no echo: a point cloud cannot tell them."""
+
+    format = "echoes"
+
+    def __init__(self, source: Recording) -> None:
+        super().__init__(source.path)
+        self._source = source
+
+    def __len__(self) -> int:
+        return len(self._source)
+
+    def read(self, i: int) -> RecordedScan:
+        scan = self._source.read(i)
+        echoes = scan.points[scan.is_return]
+        return dataclasses.replace(scan, points=echoes, is_return=np.ones(len(echoes), np.bool_))
 
 
 def bag_of(recording: Recording, folder: Path, plugin: StoragePlugin = StoragePlugin.MCAP) -> None:
