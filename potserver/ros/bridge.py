@@ -16,6 +16,7 @@ from potserver.ros.inbound import Inbound
 from potserver.ros.outbound import Outbound
 from potserver.ros.robot_feed import MapSide
 from potserver.ros.settings import RosSettings
+from potserver.ros.topics import RosNode
 
 log = get_logger("potserver.ros")
 
@@ -40,7 +41,8 @@ class Bridge:
         self._lock = threading.Lock()
         self._range_m: float | None = None
         client.on_receipt = self._count_receipt
-        self._outbound = Outbound(session, settings, client, health)
+        self._node = RosNode(session, settings.domain)
+        self._outbound = Outbound(self._node, settings, client, health)
         side = MapSide(
             client=client,
             health=health,
@@ -50,7 +52,7 @@ class Bridge:
             keep_stamps=not settings.sim_time,
             note_stamp=self._outbound.note_stamp,
         )
-        self._inbound = Inbound(session, settings, side)
+        self._inbound = Inbound(session, self._node, settings, side)
         log.info(
             "ros_bridge_started",
             domain=settings.domain,
@@ -63,7 +65,9 @@ class Bridge:
     def close(self) -> bool:
         """Take and publish no more; false if a thread did not end in time."""
         ended = self._inbound.close()
-        return self._outbound.close() and ended
+        ended = self._outbound.close() and ended
+        self._node.close()
+        return ended
 
     def _map_range_m(self) -> float:
         """The range up to which the map uses beams; asked for once.

@@ -25,10 +25,20 @@ from potclient.ros.types import (
 )
 from potserver.log import get_logger
 from potserver.ros.drops import Drops
-from potserver.ros.names import DDS_TOKENS, Names, Source, check_hash, robot_id, type_of_dds_token
+from potserver.ros.names import (
+    DDS_TOKENS,
+    Endpoint,
+    Names,
+    Source,
+    check_hash,
+    publishers_expr,
+    robot_id,
+    type_of_dds_token,
+)
 from potserver.ros.robot_feed import MapSide, RobotFeed, Waiting
 from potserver.ros.settings import TF as TF_TOPIC
 from potserver.ros.settings import RosSettings
+from potserver.ros.topics import RosNode
 from potserver.threads import spawn
 
 log = get_logger("potserver.ros")
@@ -52,8 +62,8 @@ class Inbound:
     Threads: one a subscription, which only hands on; one a robot.
     """
 
-    def __init__(self, session: zenoh.Session, settings: RosSettings, side: MapSide) -> None:
-        self._session, self._settings, self._side = session, settings, side
+    def __init__(self, session: zenoh.Session, node: RosNode, settings: RosSettings, side: MapSide) -> None:
+        self._session, self._node, self._settings, self._side = session, node, settings, side
         self._health = side.health
         self._pose_drops = Drops(side.health, "poses")
         self._lock = threading.Lock()
@@ -61,6 +71,7 @@ class Inbound:
         self._poses: dict[str, PoseTopic] = {}  # by namespace
         self._feeds: dict[str, RobotFeed] = {}  # by robot
         self._dds_types: dict[str, str] = {}  # by key of a bridge
+        self._topics: list[Names] = []  # that are subscribed to
         self._subscribers: list[Any] = []
         self._threads: list[threading.Thread] = []
         self._subscribe_all()
@@ -77,10 +88,6 @@ class Inbound:
     # --- subscriptions ------------------------------------------------------------------------------------------
 
     def _subscribe_all(self) -> None:
-        tokens = self._session.liveliness().declare_subscriber(
-            DDS_TOKENS, zenoh.handlers.FifoChannel(_POSE_CHANNEL), history=True
-        )
-        self._read(tokens, self._take_dds_token, "tokens")
         s = self._settings
         if s.poses != TF_TOPIC:
             self._subscribe(s.poses, self._take_pose, _POSE_CHANNEL)
@@ -91,6 +98,13 @@ class Inbound:
             )
         for topic in s.clouds:
             self._subscribe(topic, functools.partial(self._take_cloud, topic), _CLOUD_CHANNEL)
+        for expr, take_token in (
+            (DDS_TOKENS, self._take_dds_token),
+            (publishers_expr(s.domain), self._take_rmw_token),
+        ):
+            channel = zenoh.handlers.FifoChannel(_POSE_CHANNEL)
+            tokens = self._session.liveliness().declare_subscriber(expr, channel, history=True)
+            self._read(tokens, take_token, "tokens")
 
     def _subscribe(self, topic: str, take: Take, channel: int, *, latched: bool = False) -> None:
         """Take a topic in all namespaces, as rmw_zenoh and as zenoh-bridge-ros2dds have it.
@@ -99,6 +113,7 @@ class Inbound:
             latched: Ask for what was published before we came (transient local).
         """
         names = Names(self._settings.domain, topic)
+        self._topics.append(names)
         for expr, source_of in ((names.rmw_expr, names.of_rmw_key), (names.dds_expr, names.of_dds_key)):
             handler = zenoh.handlers.FifoChannel(channel)
             subscriber = (
@@ -130,6 +145,13 @@ class Inbound:
         key, kind = type_of_dds_token(str(sample.key_expr))
         if sample.kind == zenoh.SampleKind.PUT:
             self._dds_types[key] = kind
+
+    def _take_rmw_token(self, sample: zenoh.Sample) -> None:
+        publisher = Endpoint.of_token(str(sample.key_expr))
+        if sample.kind == zenoh.SampleKind.PUT and any(
+            names.is_of(publisher.topic) for names in self._topics
+        ):
+            self._node.list_subscription(publisher)
 
     def _take_cloud(self, topic: str, sample: zenoh.Sample, source: Source) -> None:
         self._health.count("ros.clouds.received")

@@ -24,6 +24,25 @@ class Source(NamedTuple):
     hash: str | None
 
 
+class Endpoint(NamedTuple):
+    """What the token of a publisher or subscription of rmw_zenoh tells."""
+
+    topic: str  # with its leading slash and its namespace
+    dds: str  # the type, see `dds_name`
+    hash: str
+
+    @classmethod
+    def ours(cls, topic: str, type_name: str) -> Endpoint:
+        """Of a topic with a type as we know it."""
+        return cls(topic, dds_name(type_name), type_hash(type_name))
+
+    @classmethod
+    def of_token(cls, token: str) -> Endpoint:
+        """From a token that matches `publishers_expr`."""
+        *_, topic, dds, found_hash, _qos = token.split("/")
+        return cls(topic.replace("%", "/"), dds, found_hash)
+
+
 class Names(NamedTuple):
     """The keys of one topic in a domain, as one subscribes to it in all namespaces."""
 
@@ -34,6 +53,10 @@ class Names(NamedTuple):
     def rmw_expr(self) -> str:
         """rmw_zenoh: `<domain>/<topic>/<type>/<hash>`."""
         return f"{self.domain}/**{self.topic}/*/*"
+
+    def is_of(self, topic: str) -> bool:
+        """Whether a topic, as ROS names it, is this one in some namespace."""
+        return topic.endswith(self.topic)
 
     @property
     def dds_expr(self) -> str:
@@ -65,6 +88,11 @@ def robot_id(namespace: str, default: str) -> str:
     return re.sub(r"[^a-z0-9_.-]", "-", namespace.lower().replace("/", ".")).lstrip("_.-")[:63] or default
 
 
+def publishers_expr(domain: int) -> str:
+    """The tokens of all publishers of rmw_zenoh."""
+    return f"@ros2_lv/{domain}/*/*/*/MP/*/*/*/*/*/*/*"
+
+
 def type_of_dds_token(token: str) -> tuple[str, str]:
     """The key and the type that a token of a bridge announces."""
     *_, key, kind, _qos = token.split("/")
@@ -81,12 +109,20 @@ def node_token(domain: int, zid: str) -> str:
     return f"@ros2_lv/{domain}/{zid}/0/0/NN/%/%/{NODE}"
 
 
-def publisher_token(domain: int, zid: str, entity: int, topic: str, type_name: str, *, latched: bool) -> str:
-    """The token that lists a publisher of our node: how `ros2 topic list` comes to show its topic."""
-    name = topic.replace("/", "%")
+def endpoint_token(node: str, entity: int, kind: str, said: Endpoint, *, latched: bool) -> str:
+    """The token that lists an endpoint of our node: how `ros2 topic list` comes to show its topic.
+
+    Args:
+        node: Our node's token.
+        entity: A number that no other endpoint of the node has.
+        kind: `MP`, a publisher, or `MS`, a subscription.
+        said: Topic and type.
+        latched: Transient local.
+    """
+    here = node.split("/")
+    here[4:6] = [str(entity), kind]
     qos = _RELIABLE_LATEST.format(durability="1" if latched else "")
-    kind = f"{dds_name(type_name)}/{type_hash(type_name)}"
-    return f"@ros2_lv/{domain}/{zid}/0/{entity}/MP/%/%/{NODE}/{name}/{kind}/{qos}"
+    return "/".join([*here, said.topic.replace("/", "%"), said.dds, said.hash, qos])
 
 
 def attachment(sequence: int, stamp_ns: int, gid: bytes) -> bytes:

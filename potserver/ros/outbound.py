@@ -5,8 +5,6 @@ from __future__ import annotations
 import threading
 from typing import NamedTuple
 
-import zenoh
-
 from potclient.client import MapClient
 from potclient.errors import PotclientError, UsageError
 from potclient.ros import maps
@@ -37,14 +35,11 @@ class _Stamp(NamedTuple):
 class Outbound:
     """All topics that a bridge publishes, on one thread."""
 
-    def __init__(
-        self, session: zenoh.Session, settings: RosSettings, client: MapClient, health: Health
-    ) -> None:
+    def __init__(self, node: RosNode, settings: RosSettings, client: MapClient, health: Health) -> None:
         self._settings, self._health = settings, health
         self._drops = Drops(health, "maps")
         self._newest_ns = 0
         self._ended = threading.Event()
-        node = self._node = RosNode(session, settings.domain)
         self._outputs: list[_GridOutput | _VoxelOutput] = []
         if settings.out:
             self._outputs = [
@@ -66,7 +61,6 @@ class Outbound:
         self._thread.join(_JOIN_S)
         for output in self._outputs:
             output.close()
-        self._node.close()
         return not self._thread.is_alive()
 
     def _note_revision(self, tick: messages.Revision) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import time
 import uuid
 from typing import Any
@@ -14,32 +15,44 @@ from potclient.errors import UsageError
 from potclient.link import is_matching
 from potclient.ros.types import encode
 from potclient.zenoh_config import reason_of
-from potserver.ros.names import attachment, node_token, publisher_token, topic_key
+from potserver.ros.names import Endpoint, attachment, endpoint_token, node_token, topic_key
+
+MAX_LISTED = 1024  # subscriptions of a node
 
 
 class RosNode:
-    """Our node in the ROS graph: it hands out topics, and is listed as long as it is open."""
+    """Our node in the ROS graph: it hands out topics, and is listed as long as it is open. Any thread may call."""
 
     def __init__(self, session: zenoh.Session, domain: int) -> None:
         self._session, self._domain = session, domain
-        self._zid = str(session.info.zid())
-        self._n_entities = 0
-        self._token = session.liveliness().declare_token(node_token(domain, self._zid))
+        self._name = node_token(domain, str(session.info.zid()))
+        self._entities = itertools.count(1)
+        self._tokens = [session.liveliness().declare_token(self._name)]
+        self._listed: set[Endpoint] = set()
 
     def topic(self, name: str, type_name: str, *, latched: bool) -> RosTopic:
-        """Declare a topic.
+        """Declare a topic that we publish.
 
         Args:
             latched: Whoever subscribes later gets the last message (transient local).
         """
-        self._n_entities += 1
-        token = publisher_token(self._domain, self._zid, self._n_entities, name, type_name, latched=latched)
+        said = Endpoint.ours(name, type_name)
+        token = endpoint_token(self._name, next(self._entities), "MP", said, latched=latched)
         keys = (topic_key(self._domain, name, type_name), name.lstrip("/"))
         return RosTopic(self._session, keys, type_name, token)
 
+    def list_subscription(self, publisher: Endpoint) -> None:
+        """Say that we take what a publisher publishes; some publish only then. Once is enough."""
+        if publisher in self._listed or len(self._listed) >= MAX_LISTED:
+            return
+        self._listed.add(publisher)
+        token = endpoint_token(self._name, next(self._entities), "MS", publisher, latched=False)
+        self._tokens.append(self._session.liveliness().declare_token(token))
+
     def close(self) -> None:
         """Leave the graph."""
-        self._token.undeclare()
+        for token in self._tokens:
+            token.undeclare()
 
 
 class RosTopic:

@@ -6,7 +6,7 @@ import dataclasses
 import queue
 from typing import Any
 
-from zenoh_ros2_sdk import ROS2Publisher, ROS2Subscriber, get_topic_names_and_types
+from zenoh_ros2_sdk import ROS2Publisher, ROS2Subscriber, get_topic_info, get_topic_names_and_types
 from zenoh_ros2_sdk.qos import QosDurability, QosProfile
 from zenoh_ros2_sdk.session import ZenohSession
 
@@ -64,6 +64,10 @@ class Stranger:
     def topics(self) -> dict[str, list[str]]:
         """What `ros2 topic list -t` would show."""
         return dict(get_topic_names_and_types(router_port=self.port, timeout=DEADLINE_S))
+
+    def info(self, topic: str) -> Any:
+        """What `ros2 topic info --verbose` would show."""
+        return get_topic_info(topic, router_port=self.port, timeout=DEADLINE_S, verbose=True)
 
     def close(self) -> None:
         for declared in (*self._publishers.values(), *self._subscribers):

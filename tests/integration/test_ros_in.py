@@ -103,6 +103,18 @@ def test_a_cloud_goes_in_with_the_pose_at_its_stamp(make_rig: MakeRig, stranger:
     until(lambda: rig.server.health.counter("ros.clouds.accepted") == 1, "the receipt")
 
 
+def test_we_are_listed_as_subscribers_because_some_publish_only_then(
+    make_rig: MakeRig, stranger: Callable
+) -> None:
+    rig = ros_rig(make_rig)
+    nodes = stranger(rig)
+    nodes.publish("/r1/points", cloud(T0))
+    nodes.publish("/tf", ros.tf(ros.transform("map", "lidar", T0)))
+    for topic in ("/r1/points", "/tf"):
+        info = until(lambda t=topic: (i := nodes.info(t)) and i.subscriber_count and i, topic)
+        assert [s.node_name for s in info.subscribers] == ["potserver"]
+
+
 def test_namespaces_are_robots_each_with_its_own_transforms(make_rig: MakeRig, stranger: Callable) -> None:
     rig = ros_rig(make_rig)
     nodes = stranger(rig)

@@ -14,12 +14,14 @@ from zenoh_ros2_sdk.qos import QosDurability, QosProfile
 from potclient.ros.types import NO_HASH, POINT_CLOUD, dds_name, type_hash
 from potschemas.keys import check_id
 from potserver.ros.names import (
+    Endpoint,
     Names,
     Source,
     attachment,
     check_hash,
+    endpoint_token,
     node_token,
-    publisher_token,
+    publishers_expr,
     robot_id,
     topic_key,
     type_of_dds_token,
@@ -89,12 +91,15 @@ def test_a_bridges_token_tells_key_and_type() -> None:
 
 def test_tokens_are_those_of_rmw_zenoh() -> None:
     assert node_token(3, "abc") == "@ros2_lv/3/abc/0/0/NN/%/%/potserver"
-    token = publisher_token(3, "abc", 2, "/potserver/map", POINT_CLOUD, latched=True)
+    said = Endpoint.ours("/potserver/map", POINT_CLOUD)
+    token = endpoint_token(node_token(3, "abc"), 2, "MP", said, latched=True)
+    assert Endpoint.of_token(token) == said
+    assert zenoh.KeyExpr(publishers_expr(3)).includes(zenoh.KeyExpr(token))
     *_, namespace, node, topic, dds, found_hash, qos = token.split("/")
     assert token.startswith("@ros2_lv/3/abc/0/2/MP/%/")
     assert (namespace, node, topic, dds, found_hash) == ("%", "potserver", "%potserver%map", DDS, HASH)
     assert QosProfile.decode(qos) == QosProfile(durability=QosDurability.TRANSIENT_LOCAL, history_depth=1)
-    volatile = publisher_token(3, "abc", 2, "/map", POINT_CLOUD, latched=False).rpartition("/")[2]
+    volatile = endpoint_token(node_token(3, "abc"), 2, "MS", said, latched=False).rpartition("/")[2]
     assert QosProfile.decode(volatile) == QosProfile(history_depth=1)
 
 
