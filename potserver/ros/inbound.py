@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import threading
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import zenoh
@@ -53,6 +53,7 @@ _CLOUD_CHANNEL, _POSE_CHANNEL = 4, 256
 _STATIC_SAMPLES = 64  # of each late publisher of /tf_static: every node that has one publishes its own
 _JOIN_S = 3.0
 
+Kept = TypeVar("Kept", TransformTree, PoseTopic)
 Take = Callable[[zenoh.Sample, Source], None]
 
 
@@ -143,7 +144,7 @@ class Inbound:
 
     def _take_dds_token(self, sample: zenoh.Sample) -> None:
         key, kind = type_of_dds_token(str(sample.key_expr))
-        if sample.kind == zenoh.SampleKind.PUT:
+        if sample.kind == zenoh.SampleKind.PUT and any(names.is_of(f"/{key}") for names in self._topics):
             self._dds_types[key] = kind
 
     def _take_rmw_token(self, sample: zenoh.Sample) -> None:
@@ -162,13 +163,14 @@ class Inbound:
         type_name = self._typed(sample, source, (POINT_CLOUD, LASER_SCAN), self._side.drops, robot)
         if type_name is None:
             return
-        feed = self._feeds.get(robot)
+        with self._lock:  # one topic is read by two threads
+            feed = self._feeds.get(robot)
+            if feed is None and len(self._feeds) < MAX_ROBOTS:
+                pose_of = functools.partial(self._pose_of, source.namespace)
+                feed = self._feeds[robot] = RobotFeed(robot, pose_of, self._side)
         if feed is None:
-            if len(self._feeds) >= MAX_ROBOTS:
-                self._side.drops.count("too_many_robots", robot, f"a bridge takes {MAX_ROBOTS} robots")
-                return
-            pose_of = functools.partial(self._pose_of, source.namespace)
-            feed = self._feeds[robot] = RobotFeed(robot, pose_of, self._side)
+            self._side.drops.count("too_many_robots", robot, f"a bridge takes {MAX_ROBOTS} robots")
+            return
         feed.offer(Waiting(type_name, sample.payload))
 
     def _take_tf(self, sample: zenoh.Sample, source: Source, *, static: bool) -> None:
@@ -178,8 +180,7 @@ class Inbound:
             and self._typed(sample, source, (TF,), self._pose_drops, topic) is None
         ):
             return
-        with self._lock:
-            tree = self._trees.setdefault(source.namespace, self._new_tree())
+        tree = self._of_namespace(self._trees, source.namespace, self._new_tree)
         self._note_pose(topic, lambda: tree.add(decode(sample.payload.to_bytes(), TF), static=static))
 
     def _take_pose(self, sample: zenoh.Sample, source: Source) -> None:
@@ -188,9 +189,16 @@ class Inbound:
         type_name = self._typed(sample, source, types, self._pose_drops, topic)
         if type_name is None:
             return
-        with self._lock:
-            poses = self._poses.setdefault(source.namespace, self._new_poses())
+        poses = self._of_namespace(self._poses, source.namespace, self._new_poses)
         self._note_pose(topic, lambda: poses.add(decode(sample.payload.to_bytes(), type_name), type_name))
+
+    def _of_namespace(self, table: dict[str, Kept], namespace: str, make: Callable[[], Kept]) -> Kept:
+        """The namespace's own entry; one that nobody keeps where there are too many."""
+        with self._lock:
+            if namespace in table or len(table) <= MAX_ROBOTS:
+                return table.setdefault(namespace, make())
+        self._pose_drops.count("too_many_robots", namespace, f"a bridge takes {MAX_ROBOTS} robots")
+        return make()
 
     def _note_pose(self, topic: str, take: Callable[[], None]) -> None:
         try:

@@ -18,6 +18,7 @@ from potserver.ros.settings import RosSettings
 Int64 = NDArray[np.int64]
 
 _PART_CELLS = 250_000  # of one question
+_ROUNDS = 3  # of regula falsi along an edge between voxels
 
 
 class Crossings(NamedTuple):
@@ -43,6 +44,16 @@ class Voxels(NamedTuple):
     def none(cls) -> Voxels:
         """No voxel."""
         return cls(np.zeros((0, 3), np.int64), np.zeros(0, np.bool_))
+
+
+class _Edges(NamedTuple):
+    """Ways from a cell to the next one, on which the log-odds change their sign."""
+
+    cells: Int64  # (S, 3) the lower cell
+    start: Float64  # (S, 3) m, its centre
+    step: Float64  # (S, 3) m, from there to the other centre
+    low: Float32  # (S,) log-odds at the lower cell
+    high: Float32  # (S,) and at the other
 
 
 class VoxelLayer:
@@ -87,6 +98,19 @@ class VoxelLayer:
         tree.add(self.voxels.cells + KEY_ORIGIN, self.voxels.occupied)
         return tree.leaves()
 
+    def _crossings(self, edges: _Edges) -> Crossings:
+        """Where the log-odds along edges are 0, to a few per cent of an edge, and the deviations there."""
+        left, right = np.zeros(len(edges.cells)), np.ones(len(edges.cells))
+        low, high = edges.low, edges.high
+        for _ in range(_ROUNDS):
+            share = left + (right - left) * low / (low - high)
+            points = edges.start + share[:, None] * edges.step
+            answer = self._client.occupancy(points)
+            is_low = (answer.latent_mean < 0) == (low < 0)
+            left, right = np.where(is_low, share, left), np.where(is_low, right, share)
+            low, high = np.where(is_low, answer.latent_mean, low), np.where(is_low, high, answer.latent_mean)
+        return Crossings(edges.cells, points, np.sqrt(answer.var))
+
     def _renew(self, box: Box) -> None:
         """Ask for all cells of a box, and put the answers in the place of those before."""
         s = self._settings
@@ -99,18 +123,16 @@ class VoxelLayer:
         voxels = [Voxels(self.voxels.cells[kept], self.voxels.occupied[kept])]
         kept = ~_inside(self.surface.cells, cells)
         old = Crossings(self.surface.cells[kept], self.surface.points[kept], self.surface.sd[kept])
-        cells_found, points_found = [], []
+        edges = []
         for part in cells.tiles(_PART_CELLS):
             # a cell more at the upper faces: a surface point lies between two cells, and the lower one has it
             grid = self._client.grid(part.first * s.voxel_m, (part.stop + 1) * s.voxel_m, s.voxel_m)
             voxels.append(_voxels(grid, part))
-            lower_cells, points = _crossings(grid, part)
-            cells_found.append(lower_cells)
-            points_found.append(points)
-        # between two sure voxels the map may be in doubt: the deviation at a point is asked for at the point
-        points = np.concatenate(points_found)
-        sd = np.sqrt(self._client.occupancy(points).var)
-        surface = [old, Crossings(np.concatenate(cells_found), points, sd)]
+            edges += _edges(grid, part)
+        surface = [
+            old,
+            self._crossings(_Edges(*(np.concatenate(column) for column in zip(*edges, strict=True)))),
+        ]
         self.voxels = Voxels(*(np.concatenate(column) for column in zip(*voxels, strict=True)))
         self.surface = Crossings(*(np.concatenate(column) for column in zip(*surface, strict=True)))
 
@@ -125,16 +147,16 @@ def _voxels(grid: Grid, part: CellBox) -> Voxels:
     return Voxels(np.argwhere(known) + part.first, grid.mean[inner][known] >= 0.5)
 
 
-def _crossings(grid: Grid, part: CellBox) -> tuple[Int64, Float64]:
-    """Where log-odds change their sign between two observed cells: (S, 3) the lower cells, (S, 3) m the points."""
-    inner, all_cells, all_points = (slice(-1),) * 3, [], []
+def _edges(grid: Grid, part: CellBox) -> list[_Edges]:
+    """Between observed neighbours of which one is occupied and one free, along each axis."""
+    inner, found = (slice(-1),) * 3, []
     for axis in range(3):
         beyond = tuple(slice(1, None) if a == axis else slice(-1) for a in range(3))
         low, high = grid.latent_mean[inner], grid.latent_mean[beyond]
         crosses = ((low < 0) != (high < 0)) & grid.observed[inner] & grid.observed[beyond]
         cells = np.argwhere(crosses) + part.first
-        points: Float64 = (cells + 0.5) * np.float64(part.resolution)
-        points[:, axis] += part.resolution * low[crosses] / (low[crosses] - high[crosses])
-        all_cells.append(cells)
-        all_points.append(points)
-    return np.concatenate(all_cells), np.concatenate(all_points)
+        start: Float64 = (cells + 0.5) * np.float64(part.resolution)
+        step = np.zeros_like(start)
+        step[:, axis] = part.resolution
+        found.append(_Edges(cells, start, step, low[crosses], high[crosses]))
+    return found

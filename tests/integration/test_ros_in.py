@@ -165,7 +165,10 @@ def test_a_cloud_without_a_pose_is_counted_and_the_log_names_the_frames(
     until(lambda: rig.server.health.counter("ros.poses.taken") == 1, "the transform")
     nodes.publish("/points", cloud(T0))
     dropped(rig, "no_pose")
-    assert "no transform from 'lidar' to 'map': the frames above 'lidar' are none" in caplog.text
+    until(
+        lambda: "no transform from 'lidar' to 'map': the frames above 'lidar' are none" in caplog.text,
+        "the frames",
+    )
     nodes.publish("/points", cloud(T0 + S, "base"))
     dropped(rig, "no_pose", 2)
     assert rig.mapper.scans == []

@@ -201,7 +201,7 @@ def test_surfaces_are_where_the_map_says_one_half(nodes: Stranger, client: MapCl
     points = read_point_cloud(message).points
     assert len(points) > 500
     answer = client.occupancy(points)
-    assert np.median(np.abs(answer.mean - 0.5)) < 0.2  # between voxels half a metre apart
+    assert np.median(np.abs(answer.mean - 0.5)) < 0.05
     rows = np.frombuffer(message.data.tobytes(), np.dtype([("xyz", "<f4", 3), ("sd", "<f4"), ("rgb", "<u4")]))
     assert np.allclose(rows["sd"], np.sqrt(answer.var), atol=1e-3)
     blue, red = rows["rgb"] & 255, rows["rgb"] >> 16

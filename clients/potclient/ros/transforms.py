@@ -16,6 +16,8 @@ from potclient.errors import NoTransformError, RosMessageError
 from potclient.poses import interpolate, quaternion_rotation
 from potclient.ros.types import ODOMETRY, POSE_WITH_COVARIANCE, frame_of, stamp_of
 
+MAX_FRAMES = 10_000  # of a tree
+
 
 class Track:
     """Stamped poses of one thing.
@@ -113,6 +115,10 @@ class TransformTree:
         if not parent or not child or parent == child:
             raise RosMessageError(
                 f"transform from {child!r} to {parent!r}: need two frames", reason="bad_transform"
+            )
+        if child not in self._parents and len(self._parents) >= MAX_FRAMES:
+            raise RosMessageError(
+                f"frame {child!r}: a tree has {MAX_FRAMES} frames at most", reason="too_many_frames"
             )
         t, q = transform.transform.translation, transform.transform.rotation
         pose = _pose((t.x, t.y, t.z), q, f"transform from {child} to {parent}")
