@@ -13,10 +13,15 @@ import pytest
 import zenoh
 import zenoh.ext
 
+from potclient import MapClient
+from potclient.datasets import open_dataset
 from potclient.poses import yaw_pose
 from potclient.ros import types
 from potserver.config import load_settings
+from potserver.health import Health
+from potserver.ros.bridge import Bridge
 from potserver.ros.names import topic_key
+from potserver.ros.settings import RosSettings
 from potserver.server import MapServer
 from tests.ros import messages as ros
 
@@ -59,6 +64,18 @@ def dropped(rig: Rig, reason: str, n: int = 1) -> None:
 
 def cloud(stamp_ns: int, frame: str = "lidar") -> Any:
     return ros.cloud(ros.xyz_rows(POINTS), frame, stamp_ns)
+
+
+def a_router(endpoint: str) -> zenoh.Session:
+    config = zenoh.Config()
+    for key, value in (
+        ("mode", "router"),
+        ("listen/endpoints", [endpoint]),
+        ("scouting/multicast/enabled", False),
+        ("timestamping/enabled", True),
+    ):
+        config.insert_json5(key, json.dumps(value))
+    return zenoh.open(config)
 
 
 class BridgedDds:
@@ -131,16 +148,8 @@ def test_namespaces_are_robots_each_with_its_own_transforms(make_rig: MakeRig, s
 
 def test_static_transforms_from_before_the_server_are_asked_for(make_rig: MakeRig) -> None:
     """A latched topic as rmw_zenoh has it: an advanced publisher with a cache, on a router that the server joins later."""
-    config = zenoh.Config()
     endpoint = f"tcp/127.0.0.1:{free_port()}"
-    for key, value in (
-        ("mode", "router"),
-        ("listen/endpoints", [endpoint]),
-        ("scouting/multicast/enabled", False),
-        ("timestamping/enabled", True),
-    ):
-        config.insert_json5(key, json.dumps(value))
-    with contextlib.closing(zenoh.open(config)) as router:
+    with contextlib.closing(a_router(endpoint)) as router:
         key = topic_key(0, "/tf_static", types.TF)
         publisher = zenoh.ext.declare_advanced_publisher(
             router, key, cache=zenoh.ext.CacheConfig(1), publisher_detection=True
@@ -331,11 +340,32 @@ def test_the_oldest_cloud_goes_when_too_many_wait(make_rig: MakeRig, stranger: C
     assert [(scan.stamp_ns - T0) // S for scan in rig.mapper.scans] == [0, 4, 5, 6, 7]
 
 
+def test_a_bridge_outlives_its_server(make_rig: MakeRig) -> None:
+    """Clouds without a server are counted; when one comes, the next goes in."""
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    health = Health()
+    with (
+        contextlib.closing(a_router(endpoint)) as network,
+        MapClient(session=network, timeout_s=1.0) as client,
+    ):
+        bridge = Bridge(network, client, RosSettings(clouds=("/points",), poses="/pose"), health)
+        with contextlib.closing(bridge):
+            network.put(
+                topic_key(0, "/pose", types.POSE), ros.cdr(ros.pose_stamped("map", T0, (0, 0, 0)), types.POSE)
+            )
+            key, payload = topic_key(0, "/points", types.POINT_CLOUD), ros.cdr(cloud(T0), types.POINT_CLOUD)
+            network.put(key, payload)
+            until(lambda: health.counter("ros.clouds.dropped.no_server") == 1, "a cloud without a server")
+            rig = make_rig(zenoh__connect=[endpoint])
+            client.wait_ready(DEADLINE_S)
+            network.put(key, payload)
+            n_scans(rig, 1)
+            until(lambda: health.counter("ros.clouds.accepted") == 1, "the receipt")
+            rig.close()
+
+
 def test_a_ros_robot_scores_as_the_same_scans_published(stranger: Callable) -> None:
     """The whole way with the real mapper: from a stranger's PointCloud2 and tf to answers."""
-    from potclient import MapClient
-    from potclient.datasets import open_dataset
-
     scans = open_dataset("generated")[:3]
     maps = {"maps": ["direct", "ros"], "ros.map": "ros", "ros.clouds": ["/points"], "ros.wait_s": 5.0}
     with MapServer(load_settings(overrides=maps), listen="tcp/127.0.0.1:0") as server:
