@@ -83,8 +83,10 @@ class Inbound:
             subscriber.undeclare()
         for thread in self._threads:
             thread.join(_JOIN_S)
-        closed = [feed.close(_JOIN_S) for feed in self._feeds.values()]
-        return all(closed) and not any(thread.is_alive() for thread in self._threads)
+        for feed in self._feeds.values():
+            feed.stop()
+        ended = [feed.join(_JOIN_S + self._settings.wait_s) for feed in self._feeds.values()]
+        return all(ended) and not any(thread.is_alive() for thread in self._threads)
 
     # --- subscriptions ------------------------------------------------------------------------------------------
 

@@ -4,16 +4,23 @@ from __future__ import annotations
 
 import collections
 import threading
+import time
 from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 import zenoh
 
-from potclient.arrays import Float32, Float64
+from potclient.arrays import Bool, Float32, Float64
 from potclient.client import MapClient
 from potclient.datasets.scans import limit_range
-from potclient.errors import ClosedError, NoTransformError, PotclientError, RosMessageError
+from potclient.errors import (
+    ClosedError,
+    NoTransformError,
+    PotclientError,
+    QueryTimeoutError,
+    RosMessageError,
+)
 from potclient.ros.laser_scans import level, read_laser_scan
 from potclient.ros.point_clouds import read_point_cloud
 from potclient.ros.types import LASER_SCAN, decode
@@ -25,7 +32,7 @@ from potserver.threads import spawn
 log = get_logger("potserver.ros")
 
 MAX_WAITING = 4  # clouds of a robot that may wait for their pose and for the map; the oldest goes first
-_SEND_S = 10.0  # for the map to take one
+_SEND_S, _SLICE_S = 10.0, 1.0  # for the map to take one
 
 PoseOf = Callable[[str, int], Float64]  # (4, 4) T_map_sensor of a frame at a stamp, ns
 
@@ -76,11 +83,14 @@ class RobotFeed:
         if n_too_many > 0:
             self._side.drops.count("busy", self.robot, f"more than {MAX_WAITING} clouds wait")
 
-    def close(self, timeout_s: float) -> bool:
-        """End the thread; false if it did not in time."""
+    def stop(self) -> None:
+        """Take and send no more; a cloud that is on its way ends first."""
         with self._changed:
             self._closing = True
             self._changed.notify_all()
+
+    def join(self, timeout_s: float) -> bool:
+        """Wait for the end of the thread, after `stop`; false if it did not end in time."""
         self._thread.join(timeout_s)
         for _ in range(len(self._waiting)):
             self._side.drops.count("closing", self.robot, "the bridge was closed")
@@ -125,13 +135,24 @@ class RobotFeed:
             points, pose = level(points, pose)
         if len(points) == 0:
             raise RosMessageError("no point of the scan is a number within the ranges", reason="empty")
-        side.client.publish(
-            points,
-            pose,
-            robot=self.robot,
-            stamp_ns=stamp_ns if side.keep_stamps else None,
-            is_return=is_return,
-            wait=True,
-            timeout_s=_SEND_S,
-        )
+        self._publish(points, pose, stamp_ns=stamp_ns if side.keep_stamps else None, is_return=is_return)
         side.note_stamp(stamp_ns)
+
+    def _publish(self, points: Float32, pose: Float64, *, stamp_ns: int | None, is_return: Bool) -> None:
+        """Send when there is credit, in slices of the time there is, so that a stop is seen."""
+        deadline = time.monotonic() + _SEND_S
+        while True:
+            try:
+                self._side.client.publish(
+                    points,
+                    pose,
+                    robot=self.robot,
+                    stamp_ns=stamp_ns,
+                    is_return=is_return,
+                    wait=True,
+                    timeout_s=_SLICE_S,
+                )
+                return
+            except QueryTimeoutError:
+                if self._closing or time.monotonic() > deadline:
+                    raise

@@ -326,20 +326,6 @@ def test_damaged_messages_are_counted_and_the_next_goes_in(make_rig: MakeRig, st
     n_scans(rig, 1)
 
 
-def test_the_oldest_cloud_goes_when_too_many_wait(make_rig: MakeRig, stranger: Callable) -> None:
-    rig = ros_rig(make_rig, ros__poses="/pose", ros__wait_s=DEADLINE_S)
-    nodes = stranger(rig)
-    nodes.publish("/points", cloud(T0))
-    until(lambda: rig.server.health.counter("ros.clouds.received") == 1, "the first")
-    for i in range(1, 8):  # the first waits for its pose meanwhile
-        nodes.publish("/points", cloud(T0 + i * S))
-    dropped(rig, "busy", 3)
-    for i in range(8):
-        nodes.publish("/pose", ros.pose_stamped("map", T0 + i * S, (0, 0, 0)))
-    n_scans(rig, 5)
-    assert [(scan.stamp_ns - T0) // S for scan in rig.mapper.scans] == [0, 4, 5, 6, 7]
-
-
 def test_a_bridge_outlives_its_server(make_rig: MakeRig) -> None:
     """Clouds without a server are counted; when one comes, the next goes in."""
     endpoint = f"tcp/127.0.0.1:{free_port()}"

@@ -57,6 +57,12 @@ def test_points_that_are_no_numbers_are_left_out_and_counted() -> None:
     assert read.n_invalid == 2
 
 
+def test_doubles_beyond_float32_are_no_numbers() -> None:
+    points = np.array([[1, 2, 3], [1e300, 0, 0]])
+    read = read_point_cloud(ros.cloud(ros.xyz_rows(points, [("x", "<f8"), ("y", "<f8"), ("z", "<f8")])))
+    assert (read.points.tolist(), read.n_invalid) == ([[1, 2, 3]], 1)
+
+
 @pytest.mark.parametrize(("name", "kind"), [("t", "<u4"), ("time", "<f4"), ("timestamp", "<f8")])
 def test_the_times_of_points_are_kept_beside_them(name: str, kind: str) -> None:
     points = np.array([[1, 2, 3], [np.nan, 0, 0], [6, 7, 8]], np.float32)

@@ -36,12 +36,15 @@ def read_point_cloud(message: Any) -> PointCloud:
         RosMessageError: no float field x, y or z; fields, steps and bytes do not fit together.
     """
     rows = _rows(message)
-    xyz = np.stack([rows[axis] for axis in "xyz"], axis=-1).astype(np.float32)
+    xyz = np.empty((len(rows), 3), np.float32)
+    with np.errstate(over="ignore"):  # a double beyond float32 becomes infinite, and is left out
+        for column, axis in zip(xyz.T, "xyz", strict=True):
+            column[...] = rows[axis]
     finite = np.isfinite(xyz).all(axis=1)
     time_name = next((name for name in _TIME_NAMES if name in (rows.dtype.names or ())), None)
     times = None if time_name is None else rows[time_name].astype(np.float64)[finite]
     return PointCloud(
-        points=xyz[finite],
+        points=xyz if finite.all() else xyz[finite],
         times=times,
         frame_id=frame_of(message.header.frame_id),
         stamp_ns=stamp_of(message.header),
