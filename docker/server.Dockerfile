@@ -10,7 +10,7 @@ COPY pyproject.toml constraints.txt README.md LICENSE NOTICE ./
 COPY potserver potserver
 COPY clients clients
 COPY schemas schemas
-RUN /opt/potserver/bin/pip install -q -c constraints.txt .
+RUN /opt/potserver/bin/pip install -q -c constraints.txt '.[ros]'
 
 FROM python:3.11-slim-bookworm
 # what open3d links to

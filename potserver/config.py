@@ -25,6 +25,7 @@ from potserver.adapters.session import ZenohSettings
 from potserver.errors import SettingsError
 from potserver.limits import Limits
 from potserver.mapping.settings import MappingSettings
+from potserver.ros.settings import RosSettings
 from potserver.toml import read_toml, toml_value
 
 ENV_PREFIX = "POTSERVER_"
@@ -116,6 +117,7 @@ class Settings:
     atoms: AtomSettings = dataclasses.field(default_factory=AtomSettings)
     store: StoreSettings = dataclasses.field(default_factory=StoreSettings)
     web: WebSettings = dataclasses.field(default_factory=WebSettings)
+    ros: RosSettings = dataclasses.field(default_factory=RosSettings)
     log: LogSettings = dataclasses.field(default_factory=LogSettings)
     # `mapping.profile` sets what the other keys of the table start from
     mapping: MappingSettings = dataclasses.field(default_factory=MappingSettings)
@@ -232,7 +234,7 @@ def _leaves(kind: Any, tree: Mapping[str, Any], base: Mapping[str, Any], prefix:
 
 def _kind_text(kind: Any) -> str:
     if typing.get_origin(kind) is tuple:
-        return "list of text"
+        return "list of numbers" if typing.get_args(kind)[0] is float else "list of text"
     if typing.get_origin(kind) is Mapping:
         return "table"
     accepted = [k for k in typing.get_args(kind) or (kind,) if k is not type(None)]
@@ -349,6 +351,7 @@ def _check(s: Settings) -> None:
         keys.check_id(s.server_id, "server_id")
         for map_id in s.maps:
             keys.check_map_id(map_id)
+        keys.check_id(s.ros.robot, "ros.robot")
         for robot_id in s.intake.robots:
             keys.check_id(robot_id, "intake.robots")
     except ValueError as error:
@@ -360,6 +363,7 @@ def _check(s: Settings) -> None:
             if isinstance(value, bool | tuple):
                 continue
             need(f"{table}.{field.name}", math.isfinite(value) and value > 0, "a positive number")
+    need("ros.map", s.ros.map is None or s.ros.map in s.maps, "one of `maps`")
     need("threads", s.threads is None or s.threads > 0, "at least 1")
     need("drain_timeout_s", 0 <= s.drain_timeout_s < math.inf, "a number of seconds")
     need("zenoh.mode", s.zenoh.mode in (None, "peer", "client", "router"), "peer, client or router")

@@ -19,6 +19,7 @@ from types import TracebackType
 
 import zenoh
 
+from potclient.client import MapClient
 from potschemas import __version__, keys, messages
 from potserver.adapters.presence import OtherServers
 from potserver.adapters.query_pool import QueryPool
@@ -33,6 +34,7 @@ from potserver.log import get_logger
 from potserver.mapping.service import MappingService
 from potserver.node import FLUSH_S, QUEUE_MESSAGES, MapNode, Shared
 from potserver.numerics.threads import default_threads
+from potserver.ros.bridge import Bridge
 from potserver.storage.map_store import MapStore, MemoryOnly
 from potserver.web.listener import Served, WebListener
 
@@ -75,6 +77,7 @@ class MapServer:
         self._stats: StatsPublisher | None = None
         self._stores: dict[str, MapStore] = {}
         self.web: WebListener | None = None
+        self._ros: tuple[Bridge, MapClient] | None = None
         self._stopping = threading.Event()
         self._lock = threading.Lock()  # start and stop, one at a time
         self._stopped_clean: bool | None = None
@@ -224,6 +227,9 @@ class MapServer:
         self._stats = StatsPublisher(session, keys.stats_key(s.root, s.server_id), self.stats, s.limits)
         for node in self.nodes.values():
             node.announce(s.server_id)
+        if s.ros.clouds:
+            client = MapClient(map=s.ros.map or s.maps[0], root=s.root, session=session)
+            self._ros = Bridge(session, client, s.ros, self.health), client
 
     def _open_store(self, mapper: MappingService) -> dict[str, int]:
         """Give a map what was kept of it; the newest stamps of its robots."""
@@ -239,6 +245,16 @@ class MapServer:
         )
         self._stores[mapper.map_id] = store
         return store.restore(mapper).stamps
+
+    def _close_ros(self) -> bool:
+        """Take no more clouds from ROS, and withdraw our topics; those on their way to a map count as unknown."""
+        ros, self._ros = self._ros, None
+        if ros is None:
+            return True
+        bridge, client = ros
+        ended = bridge.close()
+        client.close()
+        return ended
 
     def _close_stores(self) -> bool:
         stores, self._stores = self._stores, {}
@@ -265,6 +281,7 @@ class MapServer:
         log.info(
             "server_draining", clouds=sum(node.intake.depth for node in nodes), timeout_s=drain_timeout_s
         )
+        ros_ended = self._close_ros()
         deadline = time.monotonic() + drain_timeout_s
         for node in nodes:
             node.withdraw()
@@ -275,7 +292,9 @@ class MapServer:
             self._stats.close()
         ended = [node.close() for node in nodes]
         kept = self._close_stores()  # after the writers: a last snapshot of what they made
-        clean = all([*drained, answered, *ended, kept, close_session(session, _CLOSE_S), self._close_web()])
+        clean = all(
+            [ros_ended, *drained, answered, *ended, kept, close_session(session, _CLOSE_S), self._close_web()]
+        )
         self._session = None
         log.info("server_stopped", clean=clean, counters=self.health.counters())
         return clean

@@ -58,6 +58,7 @@ class MapClient:
         timeout_s: How long an answer may take, unless a call says otherwise.
         feed: How clouds are published, and who is told of their receipts.
         options: Zenoh session options; `connect` is added when they name no endpoint.
+        session: An open Zenoh session to use instead of one of our own; it stays open when the client is closed.
     Raises:
         UsageError: an id, the root or an option is not legal.
         NoServerError: nobody listens at the endpoint.
@@ -72,6 +73,7 @@ class MapClient:
         timeout_s: float = 10.0,
         feed: FeedOptions | None = None,
         options: SessionOptions | None = None,
+        session: zenoh.Session | None = None,
     ) -> None:
         if timeout_s <= 0:
             raise UsageError("timeout_s must be positive")
@@ -79,7 +81,7 @@ class MapClient:
         if connect is not None and not options.connect:
             options = dataclasses.replace(options, connect=(connect,))
         self.keys = map_keys(root, map)
-        self._link = Link(self.keys, options, timeout_s)
+        self._link = Link(self.keys, options, timeout_s, session)
         self._clouds = Clouds(self._link, feed or FeedOptions())
         self._points = PointsQuestion(self._link)
         self._lock = threading.Lock()  # for whoever closes first

@@ -52,6 +52,22 @@ class DatasetError(PotclientError):
     """A recording is missing, damaged, or not in the format it was opened as."""
 
 
+class RosMessageError(PotclientError):
+    """A ROS message cannot be used: its bytes are damaged, or what they say is not a scan or a pose. `reason` is one word."""
+
+    def __init__(self, message: str, *, reason: str = "bad_message") -> None:
+        super().__init__(message)
+        self.reason = reason
+
+
+class NoTransformError(PotclientError):
+    """No pose at the stamp that was asked for; the message names the frames and what is missing between them."""
+
+    def __init__(self, message: str, *, may_come: bool) -> None:
+        super().__init__(message)
+        self.may_come = may_come  # a later message may bring it
+
+
 class UsageError(PotclientError):
     """A setting or an argument is not usable; nothing was sent."""
 

@@ -101,12 +101,15 @@ class Link:
         keys: Of the map.
         options: Of the session.
         timeout_s: How long an answer may take, unless a question says otherwise.
+        session: An open one to use instead; it is left open at the end.
     Raises:
         UsageError: an option is not legal.
         NoServerError: nobody listens at the endpoint.
     """
 
-    def __init__(self, keys: MapKeys, options: SessionOptions, timeout_s: float) -> None:
+    def __init__(
+        self, keys: MapKeys, options: SessionOptions, timeout_s: float, session: zenoh.Session | None = None
+    ) -> None:
         self.keys, self.timeout_s = keys, timeout_s
         self.where = ", ".join(options.connect) or DEFAULT_ENDPOINT
         self.is_closed = False
@@ -117,7 +120,8 @@ class Link:
         self._declared: list[Any] = []
         self._subscriptions: list[Subscription] = []
         self._readers: weakref.WeakSet[Subscription] = weakref.WeakSet()  # all whose threads may still run
-        self._session = open_session(options)
+        self._owns_session = session is None
+        self._session = open_session(options) if session is None else session
         try:
             tokens = self._session.liveliness().declare_subscriber(
                 f"@{keys.root}/srv/*/*", zenoh.handlers.FifoChannel(64), history=True
@@ -144,8 +148,9 @@ class Link:
         for entity in declared:
             with contextlib.suppress(zenoh.ZError):
                 entity.undeclare()
-        with contextlib.suppress(zenoh.ZError):
-            self._session.close()
+        if self._owns_session:
+            with contextlib.suppress(zenoh.ZError):
+                self._session.close()
         # A thread that comes back from Zenoh while the interpreter shuts down aborts the process.
         until = time.monotonic() + _JOIN_S
         for reader in list(self._readers):

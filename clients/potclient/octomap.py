@@ -69,14 +69,13 @@ class OcTreeBuilder:
         return Leaves(_spread_out(codes), depth, occupied)
 
 
-def write_bt(path: str | os.PathLike[str], leaves: Leaves, resolution: float) -> int:
-    """Write a `.bt` file, whole or not at all.
+def tree_bytes(leaves: Leaves) -> tuple[bytes, int]:
+    """A tree as it stands in a `.bt` file after its header, and in a binary `octomap_msgs/Octomap`.
 
     Args:
         leaves: As `OcTreeBuilder.leaves` gives them.
-        resolution: m, edge of a voxel of the finest level.
     Returns:
-        Nodes of the tree, inner ones and leaves.
+        The bytes, and the number of nodes, inner ones and leaves.
     """
     codes = _interleave(leaves.keys)
     below_codes, below_value = np.zeros(0, np.int64), np.zeros(0, np.int64)  # nodes of the level below
@@ -91,13 +90,25 @@ def write_bt(path: str | os.PathLike[str], leaves: Leaves, resolution: float) ->
         inner.append(((parents << 3 * (DEPTH - depth + 1) << 5) | (depth - 1), bits))
         below_codes, below_value = parents, np.full(len(parents), _INNER)
     place, bits = (np.concatenate(column) for column in zip(*inner, strict=True))
-    n_nodes = len(leaves.depth) + len(place)
+    return bits[np.argsort(place)].astype("<u2").tobytes(), len(leaves.depth) + len(place)
+
+
+def write_bt(path: str | os.PathLike[str], leaves: Leaves, resolution: float) -> int:
+    """Write a `.bt` file, whole or not at all.
+
+    Args:
+        leaves: As `OcTreeBuilder.leaves` gives them.
+        resolution: m, edge of a voxel of the finest level.
+    Returns:
+        Nodes of the tree, inner ones and leaves.
+    """
+    tree, n_nodes = tree_bytes(leaves)
     header = (
         f"{_MAGIC.decode()}\n# (feel free to add / change comments, but leave the first line as it is!)\n#\n"
         f"id OcTree\nsize {n_nodes}\nres {resolution:.12g}\ndata\n"
     )
     with whole(path) as file:
-        file.write(header.encode() + bits[np.argsort(place)].astype("<u2").tobytes())
+        file.write(header.encode() + tree)
     return n_nodes
 
 

@@ -59,7 +59,7 @@ def quaternion_of(rotation: Float64) -> Float64:
     return q if q[0] >= 0 else -q
 
 
-def between(before: Float64, after: Float64, share: float) -> Float64:
+def interpolate(before: Float64, after: Float64, share: float) -> Float64:
     """(4, 4): the pose at a share of the way, 0 to 1; the turn is even, the way straight."""
     a, b = quaternion_of(before[:3, :3]), quaternion_of(after[:3, :3])
     cosine = float(a @ b)

@@ -7,11 +7,9 @@ import collections
 import threading
 import time
 
-import numpy as np
 import zenoh
-from numpy.typing import NDArray
 
-from potclient.poses import quaternion_rotation
+from potclient.poses import interpolate
 from potschemas import keys, messages
 from potserver.adapters.key_exprs import check_robot_id, sender_of
 from potserver.adapters.stamps import check_not_future
@@ -174,41 +172,3 @@ class _Track:
         if gap_ns > max_gap_ns:
             raise NoPoseError(f"the poses around the cloud's stamp are {gap_ns / 1e6:.0f} ms apart")
         return interpolate(self.poses[before], self.poses[after], (stamp_ns - self.stamps[before]) / gap_ns)
-
-
-def interpolate(start: Float64, end: Float64, fraction: float) -> Float64:
-    """A pose between two: linear in translation, along the great circle in rotation (slerp)."""
-    q0, q1 = _quaternion(start[:3, :3]), _quaternion(end[:3, :3])
-    cosine = float(q0 @ q1)
-    if cosine < 0:  # the shorter way round
-        q1, cosine = -q1, -cosine
-    angle = float(np.arccos(min(1.0, cosine)))
-    if angle < 1e-6:
-        q = (1 - fraction) * q0 + fraction * q1
-    else:
-        q = (np.sin((1 - fraction) * angle) * q0 + np.sin(fraction * angle) * q1) / np.sin(angle)
-    pose = np.eye(4)
-    pose[:3, :3] = quaternion_rotation(*(q / np.linalg.norm(q)))
-    pose[:3, 3] = (1 - fraction) * start[:3, 3] + fraction * end[:3, 3]
-    return pose
-
-
-def _quaternion(R: NDArray[np.float64]) -> Float64:
-    """(w, x, y, z) of a rotation: the best conditioned of the four ways."""
-    w2 = np.array(
-        [
-            1 + R[0, 0] + R[1, 1] + R[2, 2],
-            1 + R[0, 0] - R[1, 1] - R[2, 2],
-            1 - R[0, 0] + R[1, 1] - R[2, 2],
-            1 - R[0, 0] - R[1, 1] + R[2, 2],
-        ]
-    )
-    i = int(np.argmax(w2))
-    rows = (
-        (w2[0], R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]),
-        (R[2, 1] - R[1, 2], w2[1], R[1, 0] + R[0, 1], R[0, 2] + R[2, 0]),
-        (R[0, 2] - R[2, 0], R[1, 0] + R[0, 1], w2[2], R[2, 1] + R[1, 2]),
-        (R[1, 0] - R[0, 1], R[0, 2] + R[2, 0], R[2, 1] + R[1, 2], w2[3]),
-    )
-    q = np.array(rows[i])
-    return np.asarray(q / np.linalg.norm(q))

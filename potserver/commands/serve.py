@@ -44,6 +44,8 @@ examples:
   potserver serve --connect tcp/router:7447 --listen tcp/127.0.0.1:7448
                                                          join a Zenoh router (ROS 2 hosts have one on 7447)
   potserver serve --web 127.0.0.1:8080                   a page with the map; /live, /ready, /metrics (Prometheus)
+  potserver serve --connect tcp/127.0.0.1:7447 --listen tcp/127.0.0.1:7448 --ros /points
+                                                         map the PointCloud2 of ROS 2, publish its OccupancyGrid
   potserver serve --settings site.toml --set limits.max_cloud_points=100000
   POTSERVER_MAPS=ground,roof potserver serve             every setting is also a variable
 
@@ -56,6 +58,12 @@ def add(commands: Any) -> None:
         commands, "serve", _run, help="serve maps until a signal comes", description=_ABOUT, epilog=_EXAMPLES
     )
     add_settings_flags(parser)
+    parser.add_argument(
+        "--ros",
+        action="append",
+        metavar="TOPIC",
+        help="ROS 2 clouds to map, e.g. /points; repeatable; the map goes out as ROS 2 topics (docs/ros.md)",
+    )
 
 
 def _run(options: argparse.Namespace) -> int:

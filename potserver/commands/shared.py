@@ -42,6 +42,7 @@ _SETTING_OF_FLAG = {
     "listen": "zenoh.listen",
     "config": "zenoh.config",
     "shared_memory": "zenoh.shared_memory",
+    "ros": "ros.clouds",
 }
 
 

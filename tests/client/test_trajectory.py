@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from potclient.datasets import DatasetError, open_dataset
 from potclient.datasets.scans import stamps_of_names
 from potclient.datasets.trajectory import place_scans, read_trajectory, tum_line
-from potclient.poses import between, quaternion_of, quaternion_rotation, yaw_pose
+from potclient.poses import interpolate, quaternion_of, quaternion_rotation, yaw_pose
 
 POINTS = np.array([[1, 2, 3], [4, 5, 6.5]], np.float32)
 
@@ -31,7 +31,7 @@ def test_quaternions_and_rotations_say_the_same(q: tuple[float, ...], share: flo
     np.testing.assert_allclose(again, rotation, atol=1e-9)
     start, end = np.eye(4), np.eye(4)
     end[:3, :3] = rotation
-    partly = between(start, end, share)[:3, :3]
+    partly = interpolate(start, end, share)[:3, :3]
 
     def angle(R: np.ndarray) -> float:
         return math.acos(min(1.0, max(-1.0, (np.trace(R) - 1) / 2)))

@@ -56,6 +56,7 @@ DATASET is found out by looking at it:
   a log of Argoverse 2              two scans a sweep, one of each lidar
   a DGP scene (DDAD)                scene_*.json and its clouds
   a .log or .clf file (.bz2, .gz)   a CARMEN log of a planar laser
+  a .mcap, .db3 or .bag file        PointCloud2 or LaserScan with /tf, or --poses TOPIC; also a rosbag2 folder
   generated[:2d][:SEED]             a made-up yard
   town:STYLE[:2d][:dynamic][:SEED]  a drive through a made-up town, see `potclient town --help`""",
         epilog="""examples:
@@ -65,6 +66,7 @@ DATASET is found out by looking at it:
   potclient publish kitti/00 --odometry kiss-icp             no poses: odometry places the scans; it closes no loops
   potclient publish sim_structured --max-range 8 --hold-out 0.2
   potclient publish aces.clf.bz2 --poses aces_poses_optimised.txt --every 10 --rate 20
+  potclient publish drive.mcap --topic /points --tf
   potclient publish scans/ --robot r2 --rate 10 --drop     like a live robot: newest cloud wins""",
     )
     add_recording_arguments(parser, "DATASET")

@@ -18,6 +18,7 @@ from potclient.arrays import Float64
 from potclient.client import MapClient
 from potclient.commands.output_files import output_file, text_file
 from potclient.datasets import FORMATS, FRAMES, LAYOUTS, ODOMETRIES, Recording, open_dataset
+from potclient.datasets.bags import is_bag, open_bag
 from potclient.errors import UsageError
 from potclient.feed import FeedOptions
 from potclient.session import add_zenoh_arguments, options_from_arguments
@@ -106,10 +107,18 @@ def add_recording_arguments(parser: argparse.ArgumentParser, name: str) -> None:
     parser.add_argument("dataset", metavar=name)
     group = parser.add_argument_group("recording")
     group.add_argument("--format", choices=FORMATS, default="auto", help="default: look at it")
+    group.add_argument("--topic", metavar="TOPIC", help="bags: of the scans, if there are several")
+    group.add_argument(
+        "--tf",
+        nargs="?",
+        const="",
+        metavar="FRAME",
+        help="bags: poses in this frame from /tf and /tf_static (default: the topmost)",
+    )
     group.add_argument(
         "--poses",
         metavar="FILE",
-        help="pose file to use instead of the usual one: KITTI, TUM, or a graph's vertices",
+        help="pose file to use instead of the usual one: KITTI, TUM, a graph's vertices, or a bag's topic",
     )
     _add_placing(group)
     group.add_argument(
@@ -186,25 +195,45 @@ def open_recording(arguments: argparse.Namespace) -> Recording:
     """
     if arguments.skip < 0 or arguments.every < 1 or (arguments.limit is not None and arguments.limit < 1):
         raise UsageError("--skip must be 0 or more, --every and --limit 1 or more")
-    recording = open_dataset(
-        arguments.dataset,
-        arguments.format,
-        poses=arguments.poses,
-        frame=arguments.frame,
-        origin=arguments.origin,
-        layout=arguments.layout,
-        odometry=arguments.odometry,
-        trajectory=_trajectory_of(arguments),
-        no_return_m=arguments.no_return,
-        min_range_m=arguments.min_range,
-        max_range_m=arguments.max_range,
-    )
+    recording = _open(arguments)
     chosen = recording[arguments.skip :: arguments.every][: arguments.limit]
     if len(chosen) == 0:
         raise UsageError(
             f"{arguments.dataset}: --skip {arguments.skip} leaves none of {len(recording)} scans"
         )
     return chosen
+
+
+def _open(arguments: argparse.Namespace) -> Recording:
+    if arguments.topic is None and arguments.tf is None:
+        return open_dataset(
+            arguments.dataset,
+            arguments.format,
+            poses=arguments.poses,
+            frame=arguments.frame,
+            origin=arguments.origin,
+            layout=arguments.layout,
+            odometry=arguments.odometry,
+            trajectory=_trajectory_of(arguments),
+            no_return_m=arguments.no_return,
+            min_range_m=arguments.min_range,
+            max_range_m=arguments.max_range,
+        )
+    path = Path(arguments.dataset)
+    if not is_bag(path):
+        raise UsageError(
+            f"{path}: --topic and --tf are for bags: a .mcap, .db3 or .bag file, or a rosbag2 folder"
+        )
+    if arguments.tf is not None and arguments.poses is not None:
+        raise UsageError("--tf and --poses: poses come from one of the two")
+    return open_bag(
+        path,
+        topic=arguments.topic,
+        poses=arguments.poses,
+        frame=arguments.tf or None,
+        min_range_m=arguments.min_range,
+        max_range_m=arguments.max_range,
+    )
 
 
 @contextlib.contextmanager

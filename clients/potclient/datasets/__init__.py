@@ -4,7 +4,7 @@ Formats: `kitti` (odometry layout), `argoverse2` (a log), `dgp` (a scene, as of 
 one file, see `potclient.datasets.files`), `carmen` (2D laser logs), `generated` (a made-up yard; the path is `generated`,
 `generated:2d`, or either with `:SEED`), `town` (a drive through a made-up town, see `potclient.towns`; the path is
 `town:STYLE[:2d][:dynamic][:SENSOR][:LENGTHm][:SEED]`), `gauntlet` (doorways, poles and wires of known size; the path is
-`gauntlet[:SENSOR][:SEED]`).
+`gauntlet[:SENSOR][:SEED]`), `bag` (MCAP, rosbag2 and ROS 1 bags, see `potclient.datasets.bags`).
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from potclient.datasets.bags import is_bag, open_bag
 from potclient.datasets.carmen import DEFAULT_MAX_RANGE_M, DEFAULT_NO_RETURN_M, CarmenLog
 from potclient.datasets.clouds import FRAMES
 from potclient.datasets.files import AUTO_LAYOUT, LAYOUTS
@@ -36,7 +37,7 @@ __all__ = [
     "open_dataset",
 ]
 
-FORMATS = ("auto", *FOLDER_FORMATS, "carmen", "generated", "town", "gauntlet")
+FORMATS = ("auto", *FOLDER_FORMATS, "carmen", "generated", "town", "gauntlet", "bag")
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -98,7 +99,11 @@ def open_dataset(
     if not path.exists():
         raise DatasetError(f"{path}: no such file or folder")
     if format == "auto":
-        format, path = sniff(path)  # noqa: A001
+        format, path = ("bag", path) if is_bag(path) else sniff(path)  # noqa: A001
+    if format == "bag":
+        _refuse_odometry(how, str(path))
+        topic = None if how.poses is None else str(how.poses)
+        return open_bag(path, poses=topic, min_range_m=how.min_range_m, max_range_m=how.max_range_m)
     if format == "carmen":
         return _carmen(path, how)
     recording = open_folder(

@@ -12,7 +12,7 @@ import numpy as np
 from potclient.arrays import Float64
 from potclient.datasets.scans import natural_key, read_table, stamp_of
 from potclient.errors import DatasetError
-from potclient.poses import between, quaternion_of, quaternion_pose
+from potclient.poses import interpolate, quaternion_of, quaternion_pose
 
 # Looked for in this order. Others are named to the reader of an error or a note.
 POSE_FILES = ("poses.txt", "poses.tum", "trajectory.tum", "graph.txt")
@@ -136,7 +136,7 @@ def _at_stamps(path: Path, found: Trajectory, stamps_ns: Sequence[int]) -> Place
         elif 0 < after < len(at) and at[after] - at[after - 1] <= _MAX_GAP_S * 1e9:
             share = float(stamp - at[after - 1]) / float(at[after] - at[after - 1])
             scans.append(i)
-            poses.append(between(found.poses[after - 1], found.poses[after], share))
+            poses.append(interpolate(found.poses[after - 1], found.poses[after], share))
     note = f"poses from {path.name} ({found.form}), at the stamps of the scans"
     left = len(stamps_ns) - len(scans)
     if left:
