@@ -128,6 +128,7 @@ class Settings:
 
 # Names of earlier versions, refused with the new name or the reason why there is none.
 _RENAMED = {
+    "mapping.fade_rate": "mapping.gone_odds",
     "mapping.fine_m": "mapping.resolution_m",
     "mapping.gap_m": "mapping.free_gap_m",
 }

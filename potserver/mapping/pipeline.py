@@ -9,7 +9,7 @@ import dataclasses
 from abc import ABC, abstractmethod
 from typing import NamedTuple
 
-from potschemas.answers import AnswerRule
+from potschemas.answers import OBSERVED_ACTIVATION, AnswerRule
 from potserver.domain.dictionary import AtomDictionary
 from potserver.domain.kernel_map import KernelMap
 from potserver.domain.map_state import MapState
@@ -191,7 +191,8 @@ def integrated(
         n_kernels_transported=fused.n_transported,
         map_kernels=len(after.snapshot),
         converged=own.converged and fused.converged,
-        rule=after.snapshot.rule,
+        # atoms bring few and wide kernels: where one of them is known, so is the place
+        rule=dataclasses.replace(after.snapshot.rule, observed_activation=OBSERVED_ACTIVATION),
         changed=TileChange(after.tiled.grid.size_m, sorted(fused.tiles)),
         timings_ms=timings_ms,
     )

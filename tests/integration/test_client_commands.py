@@ -501,7 +501,7 @@ def test_load_prints_a_table_and_accounts_for_everything(run: Run, tmp_path: Pat
 
 
 def test_load_fails_when_something_is_lost(run_at: Run) -> None:
-    words = ("--robots", "1", "--planners", "0", "--hz", "20", "--seconds", "0.1", "--receipt-timeout", "0.1")
+    words = ("--robots", "1", "--planners", "0", "--hz", "20", "--seconds", "1", "--receipt-timeout", "0.1")
     with ScriptedServer() as server:
         server.on_clouds(lambda robot, cloud: None)
         status, out, _ = run_at(server.endpoint, "load", *words, "--dataset", "generated:2d")

@@ -68,7 +68,7 @@ def test_rays_are_what_the_map_says(map_client: MapClient, real_server: MapServe
     for name in ("hit_probability", "mean_m", "std_m", "quantile_m", "unknown_range_m", "unknown_share"):
         np.testing.assert_allclose(getattr(answer, name), getattr(expected, name), atol=1e-4)
     assert answer.revision == expected.map_revision
-    assert answer.hit_probability.max() > 0.9, "there is a room around it"
+    assert answer.hit_probability.max() > 0.85, "there is a room around it"
 
 
 def test_risk_is_what_the_map_says(map_client: MapClient, real_server: MapServer) -> None:
