@@ -159,7 +159,8 @@ def _map_files(path: Path) -> list[Path]:
     Raises:
         MapFileError: there are none.
     """
-    from potserver.storage.map_store import SAVED, TILES
+    from potserver.storage.agreement import TILES
+    from potserver.storage.map_store import SAVED
 
     if not path.is_dir():
         return [path]
@@ -178,9 +179,9 @@ def _one_file(path: Path) -> Path:
 
 
 def _described(path: Path) -> dict[str, Any]:
+    from potserver.storage.agreement import JOURNAL, TILES
     from potserver.storage.journal import scans_after
     from potserver.storage.map_file import FORMAT, describe, read_map
-    from potserver.storage.map_store import JOURNAL, TILES
 
     saved = read_map(path)
     r, table = saved.record, describe(saved)
@@ -270,9 +271,9 @@ def _from_saved(file: Path) -> tuple[MapState, Origin]:
 
 def _read_file(file: Path) -> tuple[SavedMap, int]:
     """The map in a file, and how many scans its journal has beyond it; says where a server writes both."""
+    from potserver.storage.agreement import JOURNAL, TILES
     from potserver.storage.journal import scans_after
     from potserver.storage.map_file import read_map
-    from potserver.storage.map_store import JOURNAL, TILES
 
     saved = read_map(file)
     if file.name != TILES:

@@ -27,12 +27,21 @@ from potserver.domain.map_state import MapState
 from potserver.domain.running_scores import RunningScores
 from potserver.domain.tiles import Tile, TiledMap, TileGrid, TileIndex
 from potserver.domain.types import KernelSet
-from potserver.errors import MapFileError, StorageError
+from potserver.errors import MapFileError
+from potserver.storage.files import disk_faults, make_private_folder
 from potserver.storage.seal import SEAL_BYTES, seal_number, sealed, unsealed
-from potserver.storage.sqlite import Kind, after_damage, connect, connect_read_only, reading, transaction
+from potserver.storage.sqlite import (
+    Kind,
+    after_damage,
+    close_keeping_log,
+    connect,
+    connect_read_only,
+    reading,
+    transaction,
+)
 from potserver.storage.tile_codec import decode_tile, encode_tile
 
-FORMAT = 1
+FORMAT = 2
 _KIND = Kind(
     application_id=0x706F746D,  # "potm"
     version=FORMAT,
@@ -40,6 +49,7 @@ _KIND = Kind(
         "CREATE TABLE tiles (x INTEGER, y INTEGER, z INTEGER, data BLOB NOT NULL, UNIQUE (x, y, z))",
         "CREATE TABLE map (id INTEGER PRIMARY KEY CHECK (id = 0), record BLOB NOT NULL)",
     ),
+    readable=(1,),
 )
 _SUM_LIMIT = 1 << 8 * SEAL_BYTES
 
@@ -50,6 +60,7 @@ class MapRecord(msgspec.Struct, frozen=True, kw_only=True):
     map_id: str
     store_id: str  # of the store whose journal goes on from here; empty in a file of its own
     number: int  # of the journal's last scan that is in it
+    edition: int = 0  # counts the snapshots of a store
     written_ns: int
     written_by: str  # version of potserver
     epoch: int
@@ -120,19 +131,22 @@ class Origin(NamedTuple):
     stamps: Mapping[str, int]  # newest accepted stamp of each robot, ns
     store_id: str = ""
     number: int = 0
+    edition: int = 0
 
 
 class MapFile:
     """A map file that is open for writing. One caller at a time."""
 
-    def __init__(self, path: Path, *, fsync: bool = True, wal: bool = True) -> None:
+    def __init__(self, path: Path, *, fsync: bool = True, wal: bool = True, must_exist: bool = False) -> None:
         """Open or make it.
 
+        Args:
+            path, fsync, wal, must_exist: See `sqlite.connect`.
         Raises:
             MapFileError, StorageError: see `sqlite.connect`.
         """
         self.path = path
-        self._connection = connect(path, _KIND, fsync=fsync, wal=wal)
+        self._connection = connect(path, _KIND, fsync=fsync, wal=wal, must_exist=must_exist)
         self._written: dict[TileIndex, tuple[int, int]] = {}  # revision and digest of each tile
         self._epoch: int | None = None  # which those revisions are of
 
@@ -185,6 +199,10 @@ class MapFile:
         with contextlib.suppress(sqlite3.Error):
             self._connection.close()
 
+    def leave(self) -> None:
+        """Close it as it was found."""
+        close_keeping_log(self._connection, self.path)
+
     def __enter__(self) -> MapFile:
         return self
 
@@ -204,15 +222,14 @@ def write_map(path: Path, state: MapState, origin: Origin) -> int:
     """
     partial = path.with_name(path.name + ".partial")
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        partial.unlink(missing_ok=True)
-        with MapFile(partial, wal=False) as file:
-            file.write(state, origin)
-        n_bytes = partial.stat().st_size
-        partial.replace(path)
-        sync_folder(path.parent)
-    except OSError as error:
-        raise StorageError(f"cannot write {path}: {error.strerror or error}") from error
+        with disk_faults("write", path):
+            make_private_folder(path.parent)
+            partial.unlink(missing_ok=True)
+            with MapFile(partial, wal=False) as file:
+                file.write(state, origin)
+            n_bytes = partial.stat().st_size
+            partial.replace(path)
+            sync_folder(path.parent)
     finally:
         with contextlib.suppress(OSError):
             partial.unlink(missing_ok=True)
@@ -261,6 +278,7 @@ def _record_of(state: MapState, origin: Origin, tiles: Mapping[TileIndex, tuple[
         map_id=origin.map_id,
         store_id=origin.store_id,
         number=origin.number,
+        edition=origin.edition,
         written_ns=time.time_ns(),
         written_by=__version__,
         epoch=state.epoch,

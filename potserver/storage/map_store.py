@@ -3,7 +3,8 @@
 A scan is in the journal, on the disk, before it is in the map and before anybody is told so. A thread of its own writes
 snapshots, from states that never change. What a snapshot has, the journal forgets with its next scan. At the start the last
 snapshot is read, and the journal's scans after it are integrated again. There are two files so that a long snapshot never holds
-up a scan. Each knows what the other must have: a file that is lost or old is noticed.
+up a scan. Each knows what the other must have, and a mark beside them how far both have come: a file that is lost, old or
+cut off is noticed (`agreement`). Nothing is acknowledged that went into files which no longer bear their names.
 """
 
 from __future__ import annotations
@@ -14,6 +15,8 @@ import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
+
+import msgspec
 
 from potserver.codec.clouds import encode_cloud, read_cloud
 from potserver.domain.map_state import MapState
@@ -29,13 +32,24 @@ from potserver.errors import (
 from potserver.health import Health
 from potserver.log import get_logger
 from potserver.mapping.service import MappingService
+from potserver.storage.agreement import (
+    JOURNAL,
+    MARK,
+    TILES,
+    Standing,
+    check_agreement,
+    check_complete,
+)
+from potserver.storage.files import NamedFiles, make_private_folder
 from potserver.storage.journal import Journal
 from potserver.storage.map_file import MapFile, Origin, SavedMap, read_map, write_map
+from potserver.storage.mark import Mark, Progress, read_mark
+from potserver.storage.sqlite import log_of
 from potserver.threads import spawn
 
 log = get_logger("potserver.store")
 
-JOURNAL, TILES, SAVED = "journal.sqlite", "tiles.sqlite", "saved"
+SAVED = "saved"
 SNAPSHOT_SCANS = 50  # a restart integrates at most so many again: seconds
 SNAPSHOT_BYTES = 64 * 2**20  # large scans make a snapshot due earlier
 MAX_SAVED = 100  # copies with a name: whoever reaches the server may ask for one more
@@ -95,20 +109,19 @@ class MapStore:
         self._saved = folder / SAVED
         self._map_id, self._keeps_evidence, self._health = map_id, keeps_evidence, health
         self._snapshot_scans, self._snapshot_bytes = snapshot_scans, snapshot_bytes
-        self._max_saved = max_saved
+        self._max_saved, self._fsync = max_saved, fsync
+        make_private_folder(folder)
+        make_private_folder(self.folder)
+        has_begun = check_complete(self.folder)
+        self._journal = Journal(self.folder / JOURNAL, fsync=fsync, must_exist=has_begun)
         try:
-            self.folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise StorageError(
-                f"cannot make the map's folder {self.folder}: {error.strerror or error}; name another one (--store), or"
-                " keep the map in memory (--in-memory)"
-            ) from error
-        self._journal = Journal(self.folder / JOURNAL, fsync=fsync)
-        try:
-            self._tiles = MapFile(self.folder / TILES, fsync=fsync)
+            self._tiles = MapFile(self.folder / TILES, fsync=fsync, must_exist=has_begun)
         except BaseException:
-            self._journal.close()
+            self._journal.leave()
             raise
+        self._mark: Mark | None = None  # from `restore` on
+        self._files: NamedFiles | None = None
+        self._edition = 0  # of the newest snapshot
         self._number = self._journal.last
         self._taken = 0  # number of the last scan that is in a snapshot
         self._unsaved_bytes = 0  # of the journal, since the last snapshot that was asked for
@@ -130,7 +143,8 @@ class MapStore:
         """
         started_s = time.perf_counter()
         saved = self._tiles.read()
-        self._check_whole(saved)
+        mark = read_mark(self.folder / MARK)
+        standing = check_agreement(self.folder, self._journal, None if saved is None else saved.record, mark)
         stamps: dict[str, int] = {}
         if saved is not None:
             stamps.update(saved.record.stamps)
@@ -143,9 +157,7 @@ class MapStore:
             if keeps_epoch:
                 self._written = mapper.state
         n_replayed = self._replay(mapper, stamps)
-        self._number = max(self._journal.last, self._taken)
-        self._asked = self._taken
-        self._newest = _Newest(mapper.state, dict(stamps), self._number)
+        self._begin(mapper.state, stamps, standing, mark)
         log.info(
             "map_restored",
             map_id=self._map_id,
@@ -157,24 +169,25 @@ class MapStore:
         )
         return Restored(mapper.n_scans, n_replayed, stamps)
 
-    def _check_whole(self, saved: SavedMap | None) -> None:
-        """The two files must be of one store, and meet."""
-        number, store_id = (0, "") if saved is None else (saved.record.number, saved.record.store_id)
-        way_out = (
-            f"move {self.folder} away, start with an empty map, and load a saved copy (`potclient map load NAME`);"
-            f" `potserver map import {self.folder} -o NAME.map` makes one of the last snapshot"
+    def _begin(
+        self, state: MapState, stamps: Mapping[str, int], standing: Standing, mark: Progress | None
+    ) -> None:
+        """From now on scans and snapshots are written."""
+        self._number, self._edition = standing.number, standing.edition
+        if standing.lacks:
+            log.warning("store_short", map_id=self._map_id, folder=str(self.folder), lacks=standing.lacks)
+            # before the journal goes on from a number that it has not reached
+            self._write(_Newest(state, dict(stamps), self._number))
+        self._journal.begin(self._number)
+        progress = mark or Progress(store_id=self._journal.store_id)
+        self._mark = Mark(
+            self.folder / MARK,
+            msgspec.structs.replace(progress, last=self._number, edition=self._edition, synced=self._fsync),
         )
-        if store_id not in ("", self._journal.store_id):
-            raise MapFileError(
-                f"{self.folder}: {JOURNAL} is missing or of another map than {TILES}; {way_out}",
-                reason="damaged",
-            )
-        if number < self._journal.pruned:
-            raise MapFileError(
-                f"{self.folder}: {TILES} is missing or too old: it has the scans up to {number}, and {JOURNAL} only those"
-                f" after {self._journal.pruned}; {way_out}",
-                reason="damaged",
-            )
+        files = [self.folder / name for name in (JOURNAL, TILES)]
+        self._files = NamedFiles([self._mark.path, *files, *map(log_of, files)])
+        self._asked = self._taken
+        self._newest = _Newest(state, dict(stamps), self._number)
 
     def _replay(self, mapper: MappingService, stamps: dict[str, int]) -> int:
         n = self._journal.last - self._taken
@@ -211,11 +224,13 @@ class MapStore:
         started_s = time.perf_counter()
         payload = encode_cloud(scan)
         try:
-            self._journal.append(payload, prune_to=self._taken)
+            self._journal.append(payload, prune_to=self._taken, check=self._check_files)
+            self._check_files()
         except StorageError:
             self._health.count("store.appends_failed")
             raise
         self._number = self._journal.last
+        self._advance_mark(last=self._number)
         self._unsaved_bytes += len(payload)
         self._health.count("store.appends")
         self._health.observe("journal", (time.perf_counter() - started_s) * 1e3)
@@ -294,6 +309,10 @@ class MapStore:
             self._closed = True
             self._changed.notify_all()
         self._thread.join()
+        if self._mark is None:  # never restored: it stays as it was found
+            self._tiles.leave()
+            self._journal.leave()
+            return True
         complete_to = None
         try:
             newest = self._newest
@@ -311,6 +330,21 @@ class MapStore:
         finally:
             self._tiles.close()
             self._journal.close()
+            self._mark.close()
+
+    def _check_files(self) -> None:
+        """Raises StorageError where what is written now is not what stands on the disk under the store's names."""
+        if self._files is not None:
+            self._files.check()
+
+    def _advance_mark(self, **numbers: int) -> None:
+        if self._mark is None:
+            return
+        try:
+            self._mark.advance(**numbers)
+        except StorageError as error:  # what was written is safe; only its loss might go unnoticed
+            self._health.count("store.marks_failed")
+            log.warning("mark_failed", map_id=self._map_id, detail=str(error))
 
     def _run(self) -> None:
         """Write the snapshots that `advance` asks for."""
@@ -336,9 +370,18 @@ class MapStore:
     def _write(self, newest: _Newest) -> None:
         started_s = time.perf_counter()
         origin = Origin(
-            self._map_id, self._keeps_evidence, newest.stamps, self._journal.store_id, newest.number
+            self._map_id,
+            self._keeps_evidence,
+            newest.stamps,
+            self._journal.store_id,
+            newest.number,
+            self._edition + 1,
         )
+        self._check_files()
         n_bytes = self._tiles.write(newest.state, origin)
+        self._check_files()
+        self._edition += 1
+        self._advance_mark(edition=self._edition)
         self._taken, self._written = newest.number, newest.state
         elapsed_ms = (time.perf_counter() - started_s) * 1e3
         self._health.count("store.snapshots")

@@ -62,7 +62,7 @@ def test_info_counts_what_is_there(saved: Path, run: Run) -> None:
     tiles = state.tiled.tiles.values()
     wanted = {
         "map": "site",
-        "format": 1,
+        "format": 2,
         "scans": 2,
         "revision": 2,
         "robots": ["ada", "bob"],

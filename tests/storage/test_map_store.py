@@ -31,9 +31,10 @@ from potserver.errors import (
 from potserver.health import Health
 from potserver.mapping.service import MappingService
 from potserver.mapping.settings import MappingSettings
+from potserver.storage.agreement import JOURNAL, MARK, TILES
 from potserver.storage.journal import Journal
 from potserver.storage.map_file import MapFile, Origin, read_map, write_map
-from potserver.storage.map_store import JOURNAL, TILES, MapStore, MemoryOnly, Restored
+from potserver.storage.map_store import MapStore, MemoryOnly, Restored
 from potserver.storage.seal import sealed, unsealed
 
 from .test_tile_codec import assert_same
@@ -71,8 +72,7 @@ class Map:
             "default",
             keeps_evidence=self.mapper.keeps_evidence,
             health=self.health,
-            fsync=False,
-            **options,
+            **{"fsync": False, **options},
         )
         try:
             self.restored: Restored = self.store.restore(self.mapper)
@@ -418,17 +418,15 @@ def _copy(crashed: tuple[Path, MapState], to: Path) -> Path:
     return to
 
 
-@pytest.mark.parametrize(
-    ("file", "what"),
-    [(TILES, "missing or too old"), (JOURNAL, "missing or of another map")],
-)
+@pytest.mark.parametrize("file", [TILES, JOURNAL, MARK])
 def test_a_lost_file_is_noticed(
-    crashed: tuple[Path, MapState], tmp_path: Path, open_map: OpenMap, file: str, what: str
+    crashed: tuple[Path, MapState], tmp_path: Path, open_map: OpenMap, file: str
 ) -> None:
     folder = _copy(crashed, tmp_path / "store")
     (folder / "default" / file).unlink()
-    with pytest.raises(MapFileError, match=what) as refused:
-        open_map(folder)
+    for _ in range(2):  # a start that was refused changes nothing
+        with pytest.raises(MapFileError, match=f"{file} is missing") as refused:
+            open_map(folder)
     assert "move" in str(refused.value), "it says what to do"
 
 
@@ -455,8 +453,8 @@ def test_another_version_is_refused_with_what_to_do(
 ) -> None:
     folder = _copy(crashed, tmp_path / "store")
     with sqlite(folder / "default" / file) as connection:
-        connection.execute("PRAGMA user_version = 2")
-    with pytest.raises(MapFileError, match="format 2, this program reads format 1") as refused:
+        connection.execute("PRAGMA user_version = 9")
+    with pytest.raises(MapFileError, match="format 9, this program writes format 2") as refused:
         open_map(folder)
     assert refused.value.reason == "version"
     assert "use the version of potserver that wrote it" in str(refused.value)
@@ -489,28 +487,6 @@ def test_a_file_that_was_cut_off_is_refused_with_what_to_do(
     read: Callable[[Path], Any] = _scans_of if file == JOURNAL else read_map
     with pytest.raises(MapFileError, match="Take another copy" if is_map else "Move it and its folder away"):
         read(tmp_path / file)
-
-
-def test_a_journal_that_was_cut_off_costs_only_its_end(tmp_path: Path, open_map: OpenMap) -> None:
-    ours = open_map(tmp_path / "store")
-    states = [ours.state]
-    for n in range(1, 5):
-        ours.take(make_scan(n))
-        states.append(ours.state)
-    whole = ours.crash(tmp_path / "whole")
-    log = whole / "default" / f"{JOURNAL}-wal"
-    size = log.stat().st_size
-    rng = random.Random(1)
-    seen = set()
-    for trial, length in enumerate([size - 1, *(rng.randrange(size) for _ in range(5))]):
-        torn = tmp_path / f"torn-{trial}"
-        shutil.copytree(whole, torn)
-        with (torn / "default" / f"{JOURNAL}-wal").open("r+b") as stream:
-            stream.truncate(length)
-        again = open_map(torn)
-        assert_same_map(states[again.restored.n_scans], again.state)
-        seen.add(again.restored.n_scans)
-    assert 3 in seen, "a log without its last byte lacks the last scan alone"
 
 
 @pytest.mark.parametrize("file", [TILES, JOURNAL, "kept.map"])
@@ -547,7 +523,7 @@ def test_a_damaged_file_is_the_same_map_or_an_error(
             assert found == wanted
         else:
             assert_same_map(wanted, found)
-    assert len(errors) > 20
+    assert len(errors) > 10
     assert all(str(folder / file) in error for error in errors), "the messages name the file"
 
 
