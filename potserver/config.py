@@ -79,6 +79,7 @@ class StoreSettings:
     fsync: Annotated[bool, "wait for the disk with each cloud; else a power cut may take the last ones"] = (
         True
     )
+    read_only: Annotated[bool, "answer from what is kept, write nothing, and take no clouds"] = False
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -358,5 +359,6 @@ def _check(s: Settings) -> None:
         not s.atoms.save or s.dictionary is not None,
         "the setting `dictionary` beside it: the built-in atoms belong to the program",
     )
+    need("store.read_only", not (s.store.read_only and s.store.directory == ""), "a store to read from")
     need("log.level", s.log.level in ("debug", "info", "warning", "error"), "debug, info, warning or error")
     need("log.format", s.log.format in ("auto", "json", "console"), "auto, json or console")

@@ -90,7 +90,7 @@ class AtomRefusedError(PotserverError):
 
 
 class ReadOnlyError(PotserverError):
-    """The server takes no changes of its dictionary."""
+    """The server takes no changes of its dictionary, or was started to change nothing at all."""
 
     code = "read_only"
 

@@ -35,6 +35,7 @@ from potserver.mapping.service import MappingService
 from potserver.node import FLUSH_S, QUEUE_MESSAGES, MapNode, Shared
 from potserver.numerics.threads import default_threads
 from potserver.storage.map_store import MapStore, MemoryOnly
+from potserver.storage.read_only import ReadOnlyStore
 
 log = get_logger("potserver.server")
 
@@ -73,7 +74,7 @@ class MapServer:
         self.nodes: dict[str, MapNode] = {}  # by map id; to look at
         self.pool: QueryPool | None = None
         self._stats: StatsPublisher | None = None
-        self._stores: dict[str, MapStore] = {}
+        self._stores: dict[str, MapStore | ReadOnlyStore] = {}
         self._stopping = threading.Event()
         self._lock = threading.Lock()  # start and stop, one at a time
         self._stopped_clean: bool | None = None
@@ -219,13 +220,14 @@ class MapServer:
         s = self.settings.store
         if not s.directory:
             return {}
-        store = MapStore(
-            Path(s.directory).expanduser(),
-            mapper.map_id,
-            keeps_evidence=mapper.keeps_evidence,
-            health=self.health,
-            fsync=s.fsync,
-        )
+        folder, map_id = Path(s.directory).expanduser(), mapper.map_id
+        store: MapStore | ReadOnlyStore
+        if s.read_only:
+            store = ReadOnlyStore(folder, map_id, keeps_evidence=mapper.keeps_evidence, health=self.health)
+        else:
+            store = MapStore(
+                folder, map_id, keeps_evidence=mapper.keeps_evidence, health=self.health, fsync=s.fsync
+            )
         self._stores[mapper.map_id] = store
         return store.restore(mapper).stamps
 

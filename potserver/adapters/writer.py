@@ -16,10 +16,11 @@ from potserver.health import Health
 from potserver.log import get_logger
 from potserver.mapping.service import MappingService
 from potserver.storage.map_store import MapStore, MemoryOnly
+from potserver.storage.read_only import ReadOnlyStore
 
 log = get_logger("potserver.writer")
 
-Keeper = MapStore | MemoryOnly
+Keeper = MapStore | MemoryOnly | ReadOnlyStore
 
 
 class MapWriter:
@@ -133,6 +134,7 @@ class MapWriter:
     def _integrate(self, job: CloudJob) -> None:
         wait_ms = job.wait_ms()
         try:
+            self._keeper.check_takes()
             scan = self._reader.read(job)
             self._stamps.check(scan.robot_id, scan.stamp_ns)
             started_s = time.perf_counter()

@@ -32,6 +32,7 @@ _SETTING_OF_FLAG = {
     "profile": "mapping.profile",
     "dictionary": "dictionary",
     "store": "store.directory",
+    "read_only": "store.read_only",
     "threads": "threads",
     "drain_timeout": "drain_timeout_s",
     "log_level": "log.level",
@@ -120,6 +121,10 @@ def add_settings_flags(parser: argparse.ArgumentParser) -> None:
     store.add_argument(
         "--in-memory", action="store_const", dest="store", const="", help="forget the maps at the end"
     )
+    server.add_argument(
+        "--read-only", action="store_const", const=True,
+        help="answer from the kept maps and write nothing: no clouds, no changes; for disks that cannot be written",
+    )  # fmt: skip
     server.add_argument(
         "--drain-timeout", type=float, metavar="S", help="seconds for waiting clouds at SIGTERM [10]"
     )

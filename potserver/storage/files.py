@@ -73,6 +73,10 @@ def claim_file(path: Path) -> None:
         except FileNotFoundError:
             os.close(os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY, _FILE_MODE))
             return
+        if not os.access(path, os.W_OK):  # SQLite would call it an I/O error
+            is_read_only = bool(os.statvfs(path).f_flag & os.ST_RDONLY)
+            number = errno.EROFS if is_read_only else errno.EACCES
+            raise OSError(number, os.strerror(number))
     if not stat.S_ISREG(mode):
         what = "a symbolic link" if stat.S_ISLNK(mode) else "no regular file"
         raise MapFileError(

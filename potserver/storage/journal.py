@@ -194,6 +194,17 @@ class Journal:
         )
 
 
+def is_in_use(path: Path) -> bool:
+    """Whether a server has a journal open."""
+    try:
+        with contextlib.closing(connect_read_only(path, _KIND, busy_s=0.0)):
+            return False
+    except StorageError as error:
+        return error.reason == "in_use"
+    except MapFileError:  # whoever opens it will say what is wrong
+        return False
+
+
 def scans_after(path: Path, number: int) -> int | None:
     """How many scans with higher numbers a journal has, or None where a server has it open; it is not changed.
 

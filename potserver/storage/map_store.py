@@ -213,6 +213,9 @@ class MapStore:
                 log.info("journal_replaying", map_id=self._map_id, n_scans=n, n_done=done)
         return done
 
+    def check_takes(self) -> None:
+        """All scans are welcome."""
+
     # --- scans ----------------------------------------------------------------------------------------------
 
     def append(self, scan: Scan) -> None:
@@ -303,16 +306,20 @@ class MapStore:
 
     # --- end ------------------------------------------------------------------------------------------------
 
+    def drop(self) -> None:
+        """Close without a last snapshot; what was never restored stays as it was found."""
+        self._end_snapshots()
+        self._tiles.leave()
+        self._journal.leave()
+        if self._mark is not None:
+            self._mark.close()
+
     def close(self) -> bool:
         """Write a last snapshot if the map has changed since the one before, and close; false if the disk refused."""
-        with self._changed:
-            self._closed = True
-            self._changed.notify_all()
-        self._thread.join()
-        if self._mark is None:  # never restored: it stays as it was found
-            self._tiles.leave()
-            self._journal.leave()
+        if self._mark is None:
+            self.drop()
             return True
+        self._end_snapshots()
         complete_to = None
         try:
             newest = self._newest
@@ -345,6 +352,12 @@ class MapStore:
         except StorageError as error:  # what was written is safe; only its loss might go unnoticed
             self._health.count("store.marks_failed")
             log.warning("mark_failed", map_id=self._map_id, detail=str(error))
+
+    def _end_snapshots(self) -> None:
+        with self._changed:
+            self._closed = True
+            self._changed.notify_all()
+        self._thread.join()
 
     def _run(self) -> None:
         """Write the snapshots that `advance` asks for."""
@@ -415,6 +428,9 @@ class MemoryOnly:
     """Keeps nothing: the store of a map that lives in memory."""
 
     durable = False
+
+    def check_takes(self) -> None:
+        """All scans are welcome."""
 
     def append(self, scan: Scan) -> None:
         """Nothing to do."""

@@ -152,7 +152,7 @@ def reading(path: Path) -> Iterator[None]:
         yield
     except (sqlite3.Error, UnicodeError, OverflowError) as error:
         if _is_locked(error):
-            raise _in_use(path) from error
+            raise in_use(path) from error
         if (reason := _disk_reason(error)) is not None:
             raise disk_fault("open", path, error, reason) from error
         raise MapFileError(
@@ -190,7 +190,7 @@ def transaction(connection: sqlite3.Connection, path: Path) -> Iterator[None]:
             raise
     except sqlite3.Error as error:  # what cannot be written is the disk's fault
         if _is_locked(error):
-            raise _in_use(path) from error
+            raise in_use(path) from error
         raise disk_fault("write", path, error, _disk_reason(error) or "io") from error
 
 
@@ -230,7 +230,8 @@ def _disk_reason(error: Exception) -> str | None:
     return next((reason for text, reason in _DISK_FAULTS.items() if text in str(error)), None)
 
 
-def _in_use(path: Path) -> StorageError:
+def in_use(path: Path) -> StorageError:
+    """What to do about a file that another server has open."""
     return StorageError(
         f"{path} is in use: another server keeps its map there; give this one a store of its own"
         " (--store, or another --server-id), or none (--in-memory)",

@@ -605,7 +605,7 @@ class ErrorCode(str, Enum):
     ATOM_REFUSED = (
         "atom_refused"  # the atom may not join the dictionary; the field `reason` says which rule it breaks
     )
-    READ_ONLY = "read_only"  # the server takes no changes of its dictionary
+    READ_ONLY = "read_only"  # the server takes no changes of its dictionary, or of anything
     UNSUPPORTED = "unsupported"  # no such operation or verb
     OVERLOADED = "overloaded"  # the queue is full; retry after retry_after_s
     DEADLINE = "deadline"  # the deadline passed before the work could start

@@ -198,6 +198,32 @@ def test_a_damaged_store_is_an_error_and_not_an_empty_map(serve: Serve, tmp_path
         serve()
 
 
+def test_a_read_only_server_answers_and_takes_nothing_in(serve: Serve) -> None:
+    server, client = serve()
+    client.one("integrate", make_cloud(seq=1, robot="r1"))
+    client.control("save", named("one"))
+    before = client.one("points", HERE)
+    client.close()
+    assert server.stop()
+    server, client = serve(store__read_only=True)
+    receipts = client.receipts("r1")
+    assert client.one("points", HERE).mean.data == before.mean.data
+    assert client.one("info").durable is False
+    assert client.error("integrate", make_cloud(seq=2, robot="r1")).code is ErrorCode.READ_ONLY
+    client.put_cloud(make_cloud(seq=3, robot="r1"))
+    (receipt,) = drain(receipts, 1)
+    assert (receipt.status.value, receipt.reason) == ("rejected", "read_only")
+    for verb, request in (
+        ("clear", messages.ControlRequest()),
+        ("save", messages.ControlRequest()),
+        ("load", named("one")),
+    ):
+        assert client.control(verb, request).code is ErrorCode.READ_ONLY
+    assert client.one("points", HERE).mean.data == before.mean.data
+    client.close()
+    assert server.stop()
+
+
 def test_in_memory_there_is_nothing_to_save(serve: Serve) -> None:
     _, client = serve(store__directory="")
     assert client.one("info").durable is False
