@@ -38,7 +38,7 @@ class IntakeSettings:
 
     max_queued: Annotated[int, "clouds that may wait, each map; one more is refused at once"] = 16
     robots: Annotated[tuple[str, ...], "robots that may send; none named: every legal id"] = ()
-    allow_old_stamps: Annotated[bool, "take clouds that are not newer than the robot's last accepted one"] = (
+    allow_repeats: Annotated[bool, "take clouds whose number is not above the last one of their session"] = (
         False
     )
     max_future_s: Annotated[
@@ -119,6 +119,7 @@ class Settings:
 _RENAMED = {
     "mapping.fine_m": "mapping.resolution_m",
     "mapping.gap_m": "mapping.free_gap_m",
+    "intake.allow_old_stamps": "intake.allow_repeats",
 }
 _NOW_FIXED = {
     "": ("seed", "stats_period_s"),

@@ -29,6 +29,7 @@ from potserver.atoms.store import AtomStore
 from potserver.codec.base import Wire
 from potserver.config import Settings, as_tree
 from potserver.domain.dictionary import AtomDictionary
+from potserver.domain.order import Heard
 from potserver.health import Health
 from potserver.log import get_logger
 from potserver.mapping.service import MappingService
@@ -100,7 +101,7 @@ class MapServer:
             mappers = [self._make_map(map_id) for map_id in s.maps]
             config = build_config(s.zenoh, root=s.root, wire_guard_bytes=s.limits.wire_guard_bytes)
             try:
-                stamps = [self._open_store(mapper) for mapper in mappers]
+                heard = [self._open_store(mapper) for mapper in mappers]
                 self._session, self._endpoints = open_session(config)
             except BaseException:
                 self._close_stores()
@@ -112,7 +113,7 @@ class MapServer:
                     others.refuse()
                     _warm_up(mappers[0])  # all maps share the compiled numerics
                     others.refuse()  # one that was warming up beside us
-                self._serve(self._session, mappers, stamps)
+                self._serve(self._session, mappers, heard)
             except BaseException:
                 self._teardown(0.0)
                 raise
@@ -176,9 +177,7 @@ class MapServer:
 
     # --- parts ----------------------------------------------------------------------------------------------
 
-    def _serve(
-        self, session: zenoh.Session, mappers: list[MappingService], stamps: list[dict[str, int]]
-    ) -> None:
+    def _serve(self, session: zenoh.Session, mappers: list[MappingService], heard: list[Heard]) -> None:
         """Declare everything, and last say that the maps are there."""
         s = self.settings
         self.pool = QueryPool(
@@ -187,9 +186,9 @@ class MapServer:
             max_queued_bytes=QUEUE_MESSAGES * s.limits.max_query_bytes,
         )
         shared = Shared(s, session, self.pool, _atom_store(mappers, s), self.health)
-        for mapper, newest in zip(mappers, stamps, strict=True):
+        for mapper, numbers in zip(mappers, heard, strict=True):
             keeper = self._stores.get(mapper.map_id, MemoryOnly())
-            self.nodes[mapper.map_id] = MapNode(mapper, keeper, newest, shared)
+            self.nodes[mapper.map_id] = MapNode(mapper, keeper, numbers, shared)
         self._stats = StatsPublisher(
             session, keys.stats_key(s.root, s.server_id), self._encode_stats, s.limits
         )
@@ -215,8 +214,8 @@ class MapServer:
             maps={node.map_id: node.mapper.state for node in nodes},
         )
 
-    def _open_store(self, mapper: MappingService) -> dict[str, int]:
-        """Give a map what was kept of it; the newest stamps of its robots."""
+    def _open_store(self, mapper: MappingService) -> Heard:
+        """Give a map what was kept of it; the last numbers of its robots."""
         s = self.settings.store
         if not s.directory:
             return {}
@@ -229,7 +228,7 @@ class MapServer:
                 folder, map_id, keeps_evidence=mapper.keeps_evidence, health=self.health, fsync=s.fsync
             )
         self._stores[mapper.map_id] = store
-        return store.restore(mapper).stamps
+        return store.restore(mapper).heard
 
     def _close_stores(self) -> bool:
         stores, self._stores = self._stores, {}

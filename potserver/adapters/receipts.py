@@ -231,6 +231,7 @@ def encode_refused(
             wait_ms=waited.wait_ms,
             map_revision=state.map_revision,
             map_kernels=len(state.snapshot),
+            next_seq=messages.ABSENT if error.next_seq is None else error.next_seq,
         )
     )
 

@@ -266,7 +266,7 @@ def _from_saved(file: Path) -> tuple[MapState, Origin]:
     if left:
         say(f"{left} scans of the journal are not in it: only a server integrates them")
     state = dataclasses.replace(saved.state(), snapshot=saved.kernel_map())
-    return state, Origin(r.map_id, r.keeps_evidence, r.stamps)
+    return state, Origin(r.map_id, r.keeps_evidence, r.heard)
 
 
 def _read_file(file: Path) -> tuple[SavedMap, int]:
@@ -371,6 +371,7 @@ def _service(
 
 
 def _merge(options: argparse.Namespace) -> int:
+    from potserver.domain.order import joined
     from potserver.storage.map_file import Origin, read_map, write_map
 
     settings = settings_of(options)
@@ -385,10 +386,8 @@ def _merge(options: argparse.Namespace) -> int:
     say(f"merging {theirs.record.n_scans} scans into {ours.record.n_scans}: some seconds for a street")
     pose = pose_flag.pose_of(*options.pose) if options.pose else np.eye(4)
     change = service.merge(theirs.state(), pose)
-    stamps = dict(ours.record.stamps)
-    for robot_id, stamp_ns in theirs.record.stamps.items():
-        stamps[robot_id] = max(stamp_ns, stamps.get(robot_id, 0))
-    origin = Origin(ours.record.map_id, ours.record.keeps_evidence, stamps)
+    heard = joined(ours.record.heard, theirs.record.heard)
+    origin = Origin(ours.record.map_id, ours.record.keeps_evidence, heard)
     n_bytes = write_map(options.out, service.state, origin)
     say(
         f"wrote {options.out}: {len(service.snapshot)} kernels, {len(change.tiles)} tiles changed, {n_bytes} bytes"

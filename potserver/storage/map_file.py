@@ -24,6 +24,7 @@ from potschemas.answers import AnswerRule
 from potserver.domain.folders import sync_folder
 from potserver.domain.kernel_map import KernelMap
 from potserver.domain.map_state import MapState
+from potserver.domain.order import Heard
 from potserver.domain.running_scores import RunningScores
 from potserver.domain.tiles import Tile, TiledMap, TileGrid, TileIndex
 from potserver.domain.types import KernelSet
@@ -69,7 +70,7 @@ class MapRecord(msgspec.Struct, frozen=True, kw_only=True):
     stamp_ns: int
     grid: tuple[float, float] | None  # size_m and fine_m; none: no scan yet
     robots: list[str]
-    stamps: dict[str, int]  # newest accepted stamp of each robot, ns
+    heard: dict[str, dict[str, int]] = {}  # see `CloudOrder`
     keeps_evidence: bool  # false: profile `paper`, kernels without rows
     rule: tuple[float, float, float, float]  # with which it answered
     scores_n: float
@@ -128,7 +129,7 @@ class Origin(NamedTuple):
 
     map_id: str
     keeps_evidence: bool
-    stamps: Mapping[str, int]  # newest accepted stamp of each robot, ns
+    heard: Heard
     store_id: str = ""
     number: int = 0
     edition: int = 0
@@ -287,7 +288,7 @@ def _record_of(state: MapState, origin: Origin, tiles: Mapping[TileIndex, tuple[
         stamp_ns=state.stamp_ns,
         grid=None if tiled is None else (tiled.grid.size_m, tiled.grid.fine_m),
         robots=[] if tiled is None else list(tiled.robots),
-        stamps=dict(origin.stamps),
+        heard={robot: dict(sessions) for robot, sessions in origin.heard.items()},
         keeps_evidence=origin.keeps_evidence,
         rule=dataclasses.astuple(rule),
         scores_n=scores.n_points,

@@ -12,7 +12,6 @@ from __future__ import annotations
 import secrets
 import threading
 import time
-from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
 
@@ -20,6 +19,7 @@ import msgspec
 
 from potserver.codec.clouds import encode_cloud, read_cloud
 from potserver.domain.map_state import MapState
+from potserver.domain.order import CloudOrder, Heard
 from potserver.domain.types import Scan
 from potserver.errors import (
     MapFileError,
@@ -62,14 +62,14 @@ class Restored(NamedTuple):
 
     n_scans: int  # in the map now
     n_replayed: int  # of those, from the journal
-    stamps: dict[str, int]  # newest accepted stamp of each robot, ns
+    heard: Heard  # the robots' last numbers
 
 
 class _Newest(NamedTuple):
     """A state of the map, and where in the journal it stands."""
 
     state: MapState
-    stamps: Mapping[str, int]
+    heard: Heard
     number: int
 
 
@@ -145,9 +145,9 @@ class MapStore:
         saved = self._tiles.read()
         mark = read_mark(self.folder / MARK)
         standing = check_agreement(self.folder, self._journal, None if saved is None else saved.record, mark)
-        stamps: dict[str, int] = {}
+        order = CloudOrder()
         if saved is not None:
-            stamps.update(saved.record.stamps)
+            order.replace(saved.record.heard)
             self._taken = saved.record.number
             # a scan that is integrated again may give other last digits: the epoch tells readers that the revision is another
             keeps_epoch = self._journal.was_closed and self._journal.last == self._taken
@@ -156,8 +156,8 @@ class MapStore:
             mapper.restore(saved.state(epoch=epoch))
             if keeps_epoch:
                 self._written = mapper.state
-        n_replayed = self._replay(mapper, stamps)
-        self._begin(mapper.state, stamps, standing, mark)
+        n_replayed = self._replay(mapper, order)
+        self._begin(mapper.state, order.heard, standing, mark)
         log.info(
             "map_restored",
             map_id=self._map_id,
@@ -167,17 +167,15 @@ class MapStore:
             map_revision=mapper.state.map_revision,
             elapsed_ms=round((time.perf_counter() - started_s) * 1e3, 1),
         )
-        return Restored(mapper.n_scans, n_replayed, stamps)
+        return Restored(mapper.n_scans, n_replayed, order.heard)
 
-    def _begin(
-        self, state: MapState, stamps: Mapping[str, int], standing: Standing, mark: Progress | None
-    ) -> None:
+    def _begin(self, state: MapState, heard: Heard, standing: Standing, mark: Progress | None) -> None:
         """From now on scans and snapshots are written."""
         self._number, self._edition = standing.number, standing.edition
         if standing.lacks:
             log.warning("store_short", map_id=self._map_id, folder=str(self.folder), lacks=standing.lacks)
             # before the journal goes on from a number that it has not reached
-            self._write(_Newest(state, dict(stamps), self._number))
+            self._write(_Newest(state, heard, self._number))
         self._journal.begin(self._number)
         progress = mark or Progress(store_id=self._journal.store_id)
         self._mark = Mark(
@@ -187,9 +185,9 @@ class MapStore:
         files = [self.folder / name for name in (JOURNAL, TILES)]
         self._files = NamedFiles([self._mark.path, *files, *map(log_of, files)])
         self._asked = self._taken
-        self._newest = _Newest(state, dict(stamps), self._number)
+        self._newest = _Newest(state, heard, self._number)
 
-    def _replay(self, mapper: MappingService, stamps: dict[str, int]) -> int:
+    def _replay(self, mapper: MappingService, order: CloudOrder) -> int:
         n = self._journal.last - self._taken
         if n > 0:
             log.info("journal_replaying", map_id=self._map_id, n_scans=n)
@@ -206,7 +204,7 @@ class MapStore:
                     reason="settings",
                 ) from error
             self._unsaved_bytes += len(payload)
-            stamps[scan.robot_id] = max(scan.stamp_ns, stamps.get(scan.robot_id, 0))
+            order.remember(scan.robot_id, scan.session, scan.seq)
             done += 1
             if time.monotonic() - reported_s > _REPORT_S:
                 reported_s = time.monotonic()
@@ -238,15 +236,15 @@ class MapStore:
         self._health.count("store.appends")
         self._health.observe("journal", (time.perf_counter() - started_s) * 1e3)
 
-    def advance(self, mapper: MappingService, stamps: Mapping[str, int]) -> None:
+    def advance(self, mapper: MappingService, heard: Heard) -> None:
         """The last scan is in the map; a snapshot is begun if enough have come. Never waits.
 
         Args:
             mapper: With it.
-            stamps: Newest accepted stamp of each robot, ns.
+            heard: The robots' last numbers, with it.
         """
         with self._changed:
-            self._newest = _Newest(mapper.state, dict(stamps), self._number)
+            self._newest = _Newest(mapper.state, heard, self._number)
             due = self._number - self._asked >= self._snapshot_scans
             if due or self._unsaved_bytes >= self._snapshot_bytes:
                 self._asked, self._unsaved_bytes = self._number, 0
@@ -255,27 +253,27 @@ class MapStore:
 
     # --- maps -----------------------------------------------------------------------------------------------
 
-    def replace(self, state: MapState, stamps: Mapping[str, int]) -> None:
+    def replace(self, state: MapState, heard: Heard) -> None:
         """Write a snapshot of a state that is about to become the map; it is on the disk when this returns.
 
         Raises:
             StorageError: the disk refuses; what was kept before still is, and the state must not become the map.
         """
         with self._writing:
-            newest = _Newest(state, dict(stamps), self._number)
+            newest = _Newest(state, heard, self._number)
             self._write(newest)
             with self._changed:
                 self._newest = newest
                 self._asked, self._unsaved_bytes = self._number, 0
 
-    def save(self, name: str | None, mapper: MappingService, stamps: Mapping[str, int]) -> str:
+    def save(self, name: str | None, mapper: MappingService, heard: Heard) -> str:
         """Write a snapshot now, and a file of its own if there is a name; what was done, for people.
 
         Raises:
             StorageError: the disk refuses. TooLargeError: there are as many files as may be.
         """
         state = mapper.state
-        self.replace(state, stamps)
+        self.replace(state, heard)
         if name is None:
             return f"the snapshot holds all {state.n_scans} scans"
         path = self._saved / f"{name}.map"
@@ -284,12 +282,12 @@ class MapStore:
             raise TooLargeError(
                 f"{len(others)} maps are saved already, the limit is {self._max_saved}: move some out of {self._saved}"
             )
-        n_bytes = write_map(path, state, Origin(self._map_id, self._keeps_evidence, stamps))
+        n_bytes = write_map(path, state, Origin(self._map_id, self._keeps_evidence, heard))
         self._health.count("store.saved")
         return f"{state.n_scans} scans saved as {path}, {n_bytes} bytes"
 
-    def load(self, name: str, mapper: MappingService) -> tuple[MapState, dict[str, int]]:
-        """Read a saved map: the state to replace the present one with, of a new epoch and a higher revision, and its stamps.
+    def load(self, name: str, mapper: MappingService) -> tuple[MapState, Heard]:
+        """Read a saved map: the state to replace the present one with, of a new epoch and a higher revision, and its numbers.
 
         Raises:
             UnknownMapError: none was saved under that name.
@@ -302,7 +300,7 @@ class MapStore:
         saved = read_map(path)
         self._check_fits(mapper, saved, path)
         revision = max(mapper.state.map_revision, saved.record.revision) + 1
-        return saved.state(epoch=secrets.randbits(62), revision=revision), dict(saved.record.stamps)
+        return saved.state(epoch=secrets.randbits(62), revision=revision), saved.record.heard
 
     # --- end ------------------------------------------------------------------------------------------------
 
@@ -385,7 +383,7 @@ class MapStore:
         origin = Origin(
             self._map_id,
             self._keeps_evidence,
-            newest.stamps,
+            newest.heard,
             self._journal.store_id,
             newest.number,
             self._edition + 1,
@@ -435,13 +433,13 @@ class MemoryOnly:
     def append(self, scan: Scan) -> None:
         """Nothing to do."""
 
-    def advance(self, mapper: MappingService, stamps: Mapping[str, int]) -> None:
+    def advance(self, mapper: MappingService, heard: Heard) -> None:
         """Nothing to do."""
 
-    def replace(self, state: MapState, stamps: Mapping[str, int]) -> None:
+    def replace(self, state: MapState, heard: Heard) -> None:
         """Nothing to do."""
 
-    def save(self, name: str | None, mapper: MappingService, stamps: Mapping[str, int]) -> str:
+    def save(self, name: str | None, mapper: MappingService, heard: Heard) -> str:
         """Not here.
 
         Raises:
@@ -449,7 +447,7 @@ class MemoryOnly:
         """
         raise UnsupportedError(_IN_MEMORY)
 
-    def load(self, name: str, mapper: MappingService) -> tuple[MapState, dict[str, int]]:
+    def load(self, name: str, mapper: MappingService) -> tuple[MapState, Heard]:
         """Not here.
 
         Raises:

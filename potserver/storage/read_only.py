@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import shutil
 import tempfile
-from collections.abc import Mapping
 from pathlib import Path
 
 from potserver.domain.map_state import MapState
+from potserver.domain.order import Heard
 from potserver.domain.types import Scan
 from potserver.errors import MapFileError, ReadOnlyError
 from potserver.health import Health
@@ -79,19 +79,19 @@ class ReadOnlyStore:
         """Raises ReadOnlyError, as all that follows does."""
         raise ReadOnlyError(_WHY)
 
-    def advance(self, mapper: MappingService, stamps: Mapping[str, int]) -> None:
+    def advance(self, mapper: MappingService, heard: Heard) -> None:
         """Not here."""
         raise ReadOnlyError(_WHY)
 
-    def replace(self, state: MapState, stamps: Mapping[str, int]) -> None:
+    def replace(self, state: MapState, heard: Heard) -> None:
         """Not here."""
         raise ReadOnlyError(_WHY)
 
-    def save(self, name: str | None, mapper: MappingService, stamps: Mapping[str, int]) -> str:
+    def save(self, name: str | None, mapper: MappingService, heard: Heard) -> str:
         """Not here."""
         raise ReadOnlyError(_WHY)
 
-    def load(self, name: str, mapper: MappingService) -> tuple[MapState, dict[str, int]]:
+    def load(self, name: str, mapper: MappingService) -> tuple[MapState, Heard]:
         """Not here."""
         raise ReadOnlyError(_WHY)
 

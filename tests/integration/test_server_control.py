@@ -19,7 +19,7 @@ from .conftest import (
 )
 
 
-def test_clear_comes_after_the_clouds_before_it_and_forgets_the_stamps(make_rig: MakeRig) -> None:
+def test_clear_comes_after_the_clouds_before_it_and_forgets_the_numbers(make_rig: MakeRig) -> None:
     rig = make_rig()
     client = rig.client()
     receipts = client.receipts("r1")
@@ -29,7 +29,7 @@ def test_clear_comes_after_the_clouds_before_it_and_forgets_the_stamps(make_rig:
     until(lambda: client.stats().queues["clouds.depth"] == 1, "one in work, one waiting")
     cleared = in_background(lambda: client.control("clear"))
     until(lambda: rig.server.nodes["default"].intake.n_barriers, "the barrier")
-    client.put_cloud(make_cloud(seq=1))  # an old stamp, but the map will be empty by then
+    client.put_cloud(make_cloud(seq=1))  # an old number, but the map will be empty by then
     until(lambda: client.stats().queues["clouds.depth"] == 2, "both waiting")
     rig.mapper.mapping.release()
     reply = cleared()

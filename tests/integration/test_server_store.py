@@ -68,7 +68,7 @@ def test_a_map_is_there_after_a_restart_and_old_clouds_are_known(serve: Serve) -
     info = client.one("info")
     assert (info.n_scans, info.map_revision) == (2, 2)
     assert client.one("points", HERE).mean.data == before.mean.data, "the very same answers"
-    assert client.error("integrate", make_cloud(seq=2, robot="r1")).code is ErrorCode.OLD_STAMP
+    assert client.error("integrate", make_cloud(seq=2, robot="r1")).code is ErrorCode.OLD_SEQ
     assert client.one("integrate", make_cloud(seq=3, robot="r1")).map_revision == 3
 
 
@@ -91,9 +91,9 @@ def test_save_load_and_clear_over_the_wire(serve: Serve) -> None:
     assert len(told[3].changed_tiles) > 0
     assert told[3].n_kernels == client.one("info").n_kernels
     assert client.one("integrate", make_cloud(seq=2, robot="r1")).map_revision == 5, (
-        "stamps are the saved map's"
+        "numbers are the saved map's"
     )
-    assert client.error("integrate", make_cloud(seq=1, robot="r1")).code is ErrorCode.OLD_STAMP
+    assert client.error("integrate", make_cloud(seq=1, robot="r1")).code is ErrorCode.OLD_SEQ
     counters = client.stats().counters
     assert (counters["maps.loaded"], counters["control.load.unknown_map"]) == (1, 1)
 

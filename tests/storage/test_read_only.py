@@ -45,7 +45,7 @@ def test_a_killed_store_is_read_whole_and_not_touched(tmp_path: Path, open_map: 
     for n in (1, 2, 3):
         ours.take(make_scan(n))
         if n == 2:
-            ours.store.save(None, ours.mapper, ours.stamps)
+            ours.store.save(None, ours.mapper, ours.heard)
     left = ours.crash(tmp_path / "left")
     before = contents(left)
     mapper, store, restored = read_only(left)

@@ -32,7 +32,7 @@ def killed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, Map
     ours = Map(folder / "served", fsync=True)
     for n in (1, 2):
         ours.take(make_scan(n))
-    ours.store.save(None, ours.mapper, ours.stamps)
+    ours.store.save(None, ours.mapper, ours.heard)
     for n in (3, 4):
         ours.take(make_scan(n))
     left = ours.crash(folder / "left")
@@ -99,7 +99,7 @@ def test_a_journal_from_an_older_copy_is_noticed(tmp_path: Path, open_map: OpenM
     ours.take(make_scan(1))
     old = ours.crash(tmp_path / "old")
     ours.take(make_scan(2))
-    ours.store.save(None, ours.mapper, ours.stamps)
+    ours.store.save(None, ours.mapper, ours.heard)
     new = ours.crash(tmp_path / "new")
     for path in (old / "default").glob(f"{JOURNAL}*"):
         shutil.copy(path, new / "default")
@@ -183,7 +183,7 @@ def test_nothing_is_acknowledged_into_files_that_are_gone(
         ours.take(make_scan(2))
     assert (refused.value.reason, ours.state) == ("gone", before)
     with pytest.raises(StorageError):
-        ours.store.save(None, ours.mapper, ours.stamps)
+        ours.store.save(None, ours.mapper, ours.heard)
     (shutil.copytree if aside.is_dir() else shutil.copy)(aside, path)  # the same bytes, and not the same file
     with pytest.raises(StorageError):
         ours.take(make_scan(2))
@@ -209,7 +209,7 @@ def test_a_store_is_for_its_owner_alone(tmp_path: Path, open_map: OpenMap) -> No
     try:
         ours = open_map(tmp_path / "store")
         ours.take(make_scan(1))
-        ours.store.save("kept", ours.mapper, ours.stamps)
+        ours.store.save("kept", ours.mapper, ours.heard)
     finally:
         os.umask(before)
     modes = {
