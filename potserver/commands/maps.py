@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from potclient.commands import export_flags, pose_flag
 from potclient.commands.output_files import file_in_new_folder
 from potclient.octomap import DEPTH, KEY_ORIGIN, Leaves, read_bt
+from potserver.commands import map_care
 from potserver.commands.shared import (
     EXIT_OK,
     add_group,
@@ -92,7 +93,7 @@ _MAX_PLACES = 20_000_000
 
 def add(commands: Any) -> None:
     """Add the verb."""
-    verbs = add_group(commands, "map", "see, export, import and merge kept maps")
+    verbs = add_group(commands, "map", "see, check, upgrade, export, import and merge kept maps")
 
     info = add_verb(verbs, "info", _info, help="what saved maps or a store hold", description=_INFO)
     info.add_argument("path", type=Path, metavar="FILE|DIR")
@@ -123,6 +124,7 @@ def add(commands: Any) -> None:
     merge.add_argument("other", type=Path, metavar="OTHER", help="the one that is taken in")
     pose_flag.add_pose_flag(merge)
 
+    map_care.add(verbs)
     for writes in (import_, merge):
         writes.add_argument(
             "-o",
@@ -181,14 +183,14 @@ def _one_file(path: Path) -> Path:
 def _described(path: Path) -> dict[str, Any]:
     from potserver.storage.agreement import JOURNAL, TILES
     from potserver.storage.journal import scans_after
-    from potserver.storage.map_file import FORMAT, describe, read_map
+    from potserver.storage.map_file import describe, read_map
 
     saved = read_map(path)
     r, table = saved.record, describe(saved)
     lines: dict[str, Any] = {
         "file": str(path),
         "map": r.map_id,
-        "format": FORMAT,
+        "format": saved.version,
         "written": time.strftime("%Y-%m-%d %H:%M:%S UTC", time.gmtime(r.written_ns / 1e9)),
         "by": f"potserver {r.written_by}",
         "scans": r.n_scans,

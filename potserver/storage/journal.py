@@ -27,7 +27,7 @@ from potserver.storage.sqlite import (
 )
 
 FORMAT = 2
-_KIND = Kind(
+KIND = Kind(
     application_id=0x706F746A,  # "potj"
     version=FORMAT,
     schema=(
@@ -57,7 +57,7 @@ class Journal:
             MapFileError: damaged, or of another version. StorageError: another server has it, or the disk refuses.
         """
         self._path = path
-        self._connection = connect(path, _KIND, fsync=fsync, exclusive=True, must_exist=must_exist)
+        self._connection = connect(path, KIND, fsync=fsync, exclusive=True, must_exist=must_exist)
         try:
             with reading(path):
                 found = self._connection.execute("SELECT content FROM head").fetchall()
@@ -197,7 +197,7 @@ class Journal:
 def is_in_use(path: Path) -> bool:
     """Whether a server has a journal open."""
     try:
-        with contextlib.closing(connect_read_only(path, _KIND, busy_s=0.0)):
+        with contextlib.closing(connect_read_only(path, KIND, busy_s=0.0)):
             return False
     except StorageError as error:
         return error.reason == "in_use"
@@ -212,7 +212,7 @@ def scans_after(path: Path, number: int) -> int | None:
         MapFileError: it is missing or damaged. StorageError: it cannot be opened.
     """
     try:
-        with contextlib.closing(connect_read_only(path, _KIND, busy_s=0.0)) as connection, reading(path):
+        with contextlib.closing(connect_read_only(path, KIND, busy_s=0.0)) as connection, reading(path):
             row = connection.execute("SELECT COUNT(*) FROM scans WHERE number > ?", (number,)).fetchone()
     except StorageError as error:
         if error.reason == "in_use":

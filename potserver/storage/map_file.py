@@ -43,7 +43,7 @@ from potserver.storage.sqlite import (
 from potserver.storage.tile_codec import decode_tile, encode_tile
 
 FORMAT = 2
-_KIND = Kind(
+KIND = Kind(
     application_id=0x706F746D,  # "potm"
     version=FORMAT,
     schema=(
@@ -95,6 +95,7 @@ class SavedMap(NamedTuple):
     record: MapRecord
     tiled: TiledMap | None
     n_bytes: int  # of the tiles as they are kept
+    version: int  # of the file's format
 
     def kernel_map(self) -> KernelMap:
         """The map that answers as the saved one did."""
@@ -147,7 +148,7 @@ class MapFile:
             MapFileError, StorageError: see `sqlite.connect`.
         """
         self.path = path
-        self._connection = connect(path, _KIND, fsync=fsync, wal=wal, must_exist=must_exist)
+        self._connection = connect(path, KIND, fsync=fsync, wal=wal, must_exist=must_exist)
         self._written: dict[TileIndex, tuple[int, int]] = {}  # revision and digest of each tile
         self._epoch: int | None = None  # which those revisions are of
 
@@ -245,7 +246,7 @@ def read_map(path: Path) -> SavedMap:
     Raises:
         MapFileError: there is no such file, or it is damaged, of another version, or holds no map yet.
     """
-    with contextlib.closing(connect_read_only(path, _KIND)) as connection:
+    with contextlib.closing(connect_read_only(path, KIND)) as connection:
         saved = _read(connection, path, {})
     if saved is None:
         raise MapFileError(
@@ -317,6 +318,7 @@ def _read(
         if len(found) != 1:
             raise _damaged(path, "its record is missing")
         record = _parse(path, found[0][0])
+        version = int(connection.execute("PRAGMA user_version").fetchone()[0])
         grid = TileGrid(*record.grid) if record.grid is not None else None
         for *named, data in connection.execute("SELECT x, y, z, data FROM tiles ORDER BY rowid"):
             if grid is None or not isinstance(data, bytes):
@@ -333,9 +335,9 @@ def _read(
     if len(tiles) != record.n_tiles or f"{_sum(d for _, d in written.values()):x}" != record.tiles_digest:
         raise _damaged(path, f"it has {len(tiles)} tiles, and not the {record.n_tiles} that were written")
     if grid is None:
-        return SavedMap(record, None, 0)
+        return SavedMap(record, None, 0, version)
     tiled = TiledMap.empty(grid)._replace(robots=tuple(record.robots)).with_tiles(tiles)
-    return SavedMap(record, tiled, n_bytes)
+    return SavedMap(record, tiled, n_bytes, version)
 
 
 def _parse(path: Path, data: object) -> MapRecord:

@@ -93,6 +93,26 @@ def connect(
     return connection
 
 
+def raise_version(path: Path, kind: Kind) -> int:
+    """Give a file of an older format that can be read the present one; the format that it had.
+
+    Raises:
+        MapFileError: not such a file, of an unknown version, damaged, or a link.
+        StorageError: it cannot be written, or somebody else has it open.
+    """
+    claim_file(path)
+    with contextlib.closing(sqlite3.connect(path, isolation_level=None, timeout=0.0)) as connection:
+        with reading(path):
+            _harden(connection)
+        _check(connection, path, kind, older=kind.readable)
+        with reading(path):
+            found = _pragma(connection, "user_version")
+        if found != kind.version:
+            with transaction(connection, path):
+                connection.execute(f"PRAGMA user_version = {kind.version}")
+    return found
+
+
 def settle(connection: sqlite3.Connection, path: Path) -> None:
     """Copy the log into the file: what was committed so far no longer needs the log.
 
