@@ -48,9 +48,8 @@ def _upgrade(options: argparse.Namespace) -> int:
     stores, _ = _found(options.path)
     if not stores:
         raise MapFileError(f"{options.path} is no store: saved maps need no upgrade", reason="missing")
-    return (
-        EXIT_OK if all([_told(upgrade_store, path, did="upgraded from") for path in stores]) else EXIT_UNCLEAN
-    )
+    outcomes = [_told(upgrade_store, path, did="upgraded from") for path in stores]
+    return EXIT_OK if all(outcomes) else EXIT_UNCLEAN
 
 
 def _found(path: Path) -> tuple[list[Path], list[Path]]:

@@ -176,6 +176,8 @@ def test_a_mistake_is_one_line_and_exit_code_two(
         ["atoms", "import"],
         ["map"],
         ["map", "info"],
+        ["map", "check"],
+        ["map", "upgrade"],
         ["map", "export"],
         ["map", "import"],
         ["map", "merge"],

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -96,6 +97,29 @@ def test_save_load_and_clear_over_the_wire(serve: Serve) -> None:
     assert client.error("integrate", make_cloud(seq=1, robot="r1")).code is ErrorCode.OLD_SEQ
     counters = client.stats().counters
     assert (counters["maps.loaded"], counters["control.load.unknown_map"]) == (1, 1)
+
+
+def test_a_backup_by_save_is_complete_and_comes_back_on_another_server(serve: Serve, tmp_path: Path) -> None:
+    server, client = serve()
+    for seq in (1, 2):
+        client.one("integrate", make_cloud(seq=seq, robot="r1"))
+    client.control("save", named("nightly"))  # while it serves: complete as of this moment
+    before = client.one("points", HERE)
+    (file,) = (tmp_path / "store" / "saved").rglob("nightly.map")
+    shutil.copy(file, tmp_path / "backup.map")
+    client.one("integrate", make_cloud(seq=3, robot="r1"))
+    client.close()
+    assert server.stop()
+    shutil.rmtree(tmp_path / "store")  # the disk is lost
+    _, client = serve()
+    client.control("save", named("nightly"))
+    (place,) = (tmp_path / "store" / "saved").rglob("nightly.map")
+    shutil.copy(tmp_path / "backup.map", place)
+    client.control("load", named("nightly"))
+    assert client.one("info").n_scans == 2
+    assert client.one("points", HERE).mean.data == before.mean.data
+    assert client.error("integrate", make_cloud(seq=2, robot="r1")).code is ErrorCode.OLD_SEQ
+    client.one("integrate", make_cloud(seq=3, robot="r1"))  # the robot sends again what came after
 
 
 def test_names_where_they_belong_and_nowhere_else(serve: Serve) -> None:
