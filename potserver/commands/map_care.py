@@ -14,12 +14,14 @@ if TYPE_CHECKING:
     from potserver.storage.care import Checked
 
 _CHECK = """\
-Read every byte of saved maps (*.map), of one map's folder, or of a whole store, and see that the files of a store agree.
-Nothing is changed: a store is copied first, into a temporary folder. Exit code 1 where something is not sound."""
+Read every byte of saved maps (*.map), of one map's folder, or of a whole store, and see that the files of a
+store agree. Nothing is changed: a store is copied first, into a temporary folder. Exit code 1 where something is
+not sound."""
 
 _UPGRADE = """\
-Bring one map's folder, or a whole store, up to the format that this version writes. No server may have it open. Each map is
-checked first, on a copy; one that is not sound stays as it is. Saved maps (*.map) of older formats are read as they are."""
+Bring one map's folder, or a whole store, up to the format that this version writes. No server may have it open.
+Each map is checked first, on a copy; one that is not sound stays as it is. Saved maps (*.map) of older formats are
+read as they are."""
 
 _WHERE = "a map's folder, or a store"
 
