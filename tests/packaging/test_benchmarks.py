@@ -9,7 +9,9 @@ from pathlib import Path
 import pytest
 
 
-@pytest.mark.parametrize("name", ["equal_time", "ghosts", "kill", "laps", "learner_curves", "mirror"])
+@pytest.mark.parametrize(
+    "name", ["equal_time", "ghosts", "kill", "laps", "learner_curves", "mirror", "torture"]
+)
 def test_a_benchmark_tells_its_flags(root: Path, name: str) -> None:
     run = subprocess.run(
         [sys.executable, str(root / "benchmarks" / f"{name}.py"), "--help"],
