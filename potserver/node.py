@@ -21,7 +21,7 @@ from potserver.adapters.questions.control import ControlQueryable
 from potserver.adapters.questions.question import Served
 from potserver.adapters.questions.registry import QUESTIONS
 from potserver.adapters.receipts import ReceiptSender
-from potserver.adapters.writer import Keeper, MapWriter
+from potserver.adapters.writer import Bounds, Keeper, MapWriter
 from potserver.atoms.store import AtomStore
 from potserver.config import Settings
 from potserver.domain.order import CloudOrder, Heard
@@ -98,7 +98,7 @@ class MapNode:
             mapper,
             keeper,
             order=CloudOrder(heard, allow_repeats=settings.intake.allow_repeats),
-            max_future_s=settings.intake.max_future_s,
+            bounds=Bounds(settings.intake.max_future_s, limits.max_coordinate_m, limits.max_map_bytes),
             intake=self.intake,
             reader=CloudReader(limits, poses, frozenset(settings.intake.robots)),
             receipts=self._receipts,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from typing import NamedTuple
 
 from potserver.adapters.clouds import CloudReader
 from potserver.adapters.intake import CloudJob, IntakeQueue
@@ -11,8 +12,9 @@ from potserver.adapters.replies import BUG
 from potserver.adapters.stamps import check_not_future
 from potserver.domain.map_state import MapState
 from potserver.domain.order import CloudOrder
+from potserver.domain.tiles import MapSize, check_reach
 from potserver.domain.types import Float64, TileChange
-from potserver.errors import PotserverError
+from potserver.errors import MapFullError, PotserverError
 from potserver.health import Health
 from potserver.log import get_logger
 from potserver.mapping.service import MappingService
@@ -24,6 +26,14 @@ log = get_logger("potserver.writer")
 Keeper = MapStore | MemoryOnly | ReadOnlyStore
 
 
+class Bounds(NamedTuple):
+    """What the writer refuses."""
+
+    max_future_s: float  # stamps so far ahead
+    max_coordinate_m: float  # of what is merged into the map
+    max_map_bytes: int  # no cloud enters a map of so many
+
+
 class MapWriter:
     """Takes clouds from the intake queue, decodes, integrates, and answers each."""
 
@@ -33,14 +43,15 @@ class MapWriter:
         keeper: Keeper,
         *,
         order: CloudOrder,
-        max_future_s: float,
+        bounds: Bounds,
         intake: IntakeQueue,
         reader: CloudReader,
         receipts: ReceiptSender,
         health: Health,
     ) -> None:
         self._map_id, self._mapper, self._keeper, self._order = mapper.map_id, mapper, keeper, order
-        self._max_future_s = max_future_s
+        self._bounds = bounds
+        self._size = MapSize()
         self._intake, self._reader, self._receipts, self._health = intake, reader, receipts, health
 
     def run(self) -> None:
@@ -104,9 +115,12 @@ class MapWriter:
         Raises:
             UnsupportedError: the map is kept in memory only.
             UnknownMapError, MapFileError: there is no such map, or it cannot be used.
+            OutOfRangeError: the transform takes it to where no map may be.
             StorageError: the store does not take it.
         """
         other, _ = self._keeper.load(name, self._mapper)
+        if other.tiled is not None:
+            check_reach(other.tiled, T_map_saved, self._bounds.max_coordinate_m)
         changed = self._mapper.merge(other, T_map_saved, commit=self._keep)
         self._health.count("maps.merged")
         self._tell(changed)
@@ -129,6 +143,14 @@ class MapWriter:
         log.info("robot_forgotten", map_id=self._map_id, robot_id=robot_id, n_tiles=len(changed.tiles))
         return f"nothing from {robot_id} is left, {len(changed.tiles)} tiles changed"
 
+    def _check_room(self) -> None:
+        n_bytes = self._size.of(self._mapper.state.tiled)
+        if n_bytes >= self._bounds.max_map_bytes:
+            raise MapFullError(
+                f"the map has {n_bytes} bytes, the limit is {self._bounds.max_map_bytes} (limits.max_map_bytes): save and clear"
+                " it, or forget a robot"
+            )
+
     def _keep(self, state: MapState) -> None:
         self._keeper.replace(state, self._order.heard)
 
@@ -140,8 +162,9 @@ class MapWriter:
         wait_ms = job.wait_ms()
         try:
             self._keeper.check_takes()
+            self._check_room()
             scan = self._reader.read(job)
-            check_not_future(scan.stamp_ns, self._max_future_s)
+            check_not_future(scan.stamp_ns, self._bounds.max_future_s)
             self._order.check(scan.robot_id, scan.session, scan.seq)
             started_s = time.perf_counter()
             update = self._mapper.integrate(scan, commit=lambda: self._keeper.append(scan))

@@ -195,7 +195,7 @@ def _described(path: Path) -> dict[str, Any]:
         "by": f"potserver {r.written_by}",
         "scans": r.n_scans,
         "revision": r.revision,
-        "robots": r.robots,
+        "robots": [robot for robot in r.robots if robot],
         "tiles": r.n_tiles,
         "kernels": table.n_kernels,
         "rows": table.n_rows,
@@ -374,6 +374,7 @@ def _service(
 
 def _merge(options: argparse.Namespace) -> int:
     from potserver.domain.order import joined
+    from potserver.domain.tiles import check_reach
     from potserver.storage.map_file import Origin, read_map, write_map
 
     settings = settings_of(options)
@@ -385,8 +386,10 @@ def _merge(options: argparse.Namespace) -> int:
     size_m = ours.record.grid[0] if ours.record.grid else settings.mapping.tile_size_m
     service = _service(dataclasses.replace(settings.mapping, tile_size_m=size_m), settings)
     service.restore(ours.state())
-    say(f"merging {theirs.record.n_scans} scans into {ours.record.n_scans}: some seconds for a street")
     pose = pose_flag.pose_of(*options.pose) if options.pose else np.eye(4)
+    if (moved := theirs.state().tiled) is not None:
+        check_reach(moved, pose, settings.limits.max_coordinate_m)
+    say(f"merging {theirs.record.n_scans} scans into {ours.record.n_scans}: some seconds for a street")
     change = service.merge(theirs.state(), pose)
     heard = joined(ours.record.heard, theirs.record.heard)
     origin = Origin(ours.record.map_id, ours.record.keeps_evidence, heard)

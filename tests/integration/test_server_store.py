@@ -122,6 +122,20 @@ def test_a_backup_by_save_is_complete_and_comes_back_on_another_server(serve: Se
     client.one("integrate", make_cloud(seq=3, robot="r1"))  # the robot sends again what came after
 
 
+def test_a_full_map_takes_no_cloud_until_there_is_room(serve: Serve) -> None:
+    _, client = serve(limits__max_map_bytes=1)
+    receipts = client.receipts("r2")
+    client.one("integrate", make_cloud(seq=1, robot="r1"))
+    client.put_cloud(make_cloud(seq=1), robot="r2")
+    (refused,) = drain(receipts, 1)
+    assert (refused.status.value, refused.reason) == ("rejected", "map_full")
+    assert "limits.max_map_bytes" in refused.message
+    client.control("clear")
+    client.put_cloud(make_cloud(seq=2), robot="r2")
+    (taken,) = drain(receipts, 1)
+    assert taken.status.value == "accepted"
+
+
 def test_names_where_they_belong_and_nowhere_else(serve: Serve) -> None:
     _, client = serve()
     assert client.control("load").code is ErrorCode.BAD_MESSAGE
@@ -159,6 +173,10 @@ def test_maps_merge_and_robots_are_forgotten_over_the_wire(serve: Serve) -> None
     assert client.one("info").n_kernels == pytest.approx(alone.n_kernels, rel=0.02)
     assert client.control("forget", messages.ControlRequest(robot="r3")).code is ErrorCode.UNKNOWN_ROBOT
     assert client.control("merge", named("ours")).code is ErrorCode.UNKNOWN_MAP
+    far = np.eye(4)
+    far[1, 3] = 3e10
+    beyond = messages.ControlRequest(name="theirs", T_map_saved=wire.encode_array(far))
+    assert client.control("merge", beyond).code is ErrorCode.OUT_OF_RANGE
     skewed = messages.ControlRequest(name="theirs", T_map_saved=wire.encode_array(2.0 * pose))
     assert client.control("merge", skewed).code is ErrorCode.BAD_POSE
     counters = client.stats().counters
@@ -178,9 +196,8 @@ def test_what_was_merged_and_forgotten_is_so_after_a_restart(serve: Serve) -> No
     assert server.stop()
     _, client = serve()
     assert client.one("points", HERE).mean.data == before.mean.data
-    assert client.control("forget", messages.ControlRequest(robot="r2")).verb == "forget", (
-        "nothing is left to change"
-    )
+    again = client.control("forget", messages.ControlRequest(robot="r2"))
+    assert (again.code, "scans from r1" in again.message) == (ErrorCode.UNKNOWN_ROBOT, True)
 
 
 def test_a_cloud_that_the_disk_refuses_is_dropped_with_that_reason(serve: Serve) -> None:
