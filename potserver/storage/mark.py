@@ -46,6 +46,7 @@ class Mark:
         """
         self.path = path
         self._progress, self._lock = progress, threading.Lock()
+        _make(path, progress)
         claim_file(path)
         with disk_faults("write", path):
             self._descriptor = os.open(path, os.O_WRONLY | os.O_NOFOLLOW)
@@ -70,9 +71,9 @@ class Mark:
             self._progress = msgspec.structs.replace(
                 now, last=max(now.last, last), edition=max(now.edition, edition), turn=now.turn + 1
             )
-            content = msgspec.json.encode(self._progress).ljust(_SLOT_BYTES - SEAL_BYTES)
+            place = self._progress.turn % _SLOTS * _SLOT_BYTES
             with disk_faults("write", self.path):
-                os.pwrite(self._descriptor, sealed(content), self._progress.turn % _SLOTS * _SLOT_BYTES)
+                os.pwrite(self._descriptor, _slot(self._progress), place)
 
     def close(self) -> None:
         """Close; a second time does nothing."""
@@ -100,6 +101,25 @@ def read_mark(path: Path) -> Progress | None:
     if len(sound) < _SLOTS:
         log.warning("mark_half_damaged", file=str(path))
     return max(sound, key=lambda slot: slot.turn)
+
+
+def _make(path: Path, progress: Progress) -> None:
+    """Give a store its mark, which gets its name when it is complete."""
+    with disk_faults("write", path):
+        if os.path.lexists(path):
+            return
+        new = path.with_name(f"{path.name}.new")
+        new.unlink(missing_ok=True)
+        claim_file(new)
+        new.write_bytes(_slot(progress) * _SLOTS)
+        with new.open("rb") as stream:
+            os.fsync(stream.fileno())
+        new.replace(path)
+        sync_folder(path.parent)
+
+
+def _slot(progress: Progress) -> bytes:
+    return sealed(msgspec.json.encode(progress).ljust(_SLOT_BYTES - SEAL_BYTES))
 
 
 def _parse(data: bytes) -> Progress | None:
