@@ -5,7 +5,8 @@
 
 1. Calls: the process of a store is killed before, or in the middle of, every write, fsync, truncate, rename and unlink, or
    the disk refuses that call, or it and all that follow. A C compiler is needed: the calls are caught by a preloaded library.
-2. Files: in every piece of every file of a store a bit flips, a sector is cleared, or the file ends.
+2. Files: in every piece of every file of a store a bit flips, a sector is cleared, or the file ends. And a running store is
+   copied, file by file.
 3. Messages: hostile ones, over Zenoh.
 4. Kills: SIGKILL of a server under load (`kill.py`).
 """
@@ -25,7 +26,7 @@ from pathlib import Path
 
 from benchmarks import kill
 from benchmarks.torture_messages import torture_messages
-from benchmarks.torture_store import Outcomes, build_shim, torture_files
+from benchmarks.torture_store import Outcomes, build_shim, torture_copies, torture_files
 
 
 def run_calls(every: int) -> list[Outcomes]:
@@ -88,7 +89,9 @@ def main() -> int:
     wrong, begun_s = 0, time.monotonic()
     wrong += told("faults of calls", run_calls(options.every), begun_s)
     begun_s = time.monotonic()
-    wrong += told("damage of files", torture_files(options.pieces, options.seed, show), begun_s)
+    wrong += told(
+        "damage of files", [*torture_files(options.pieces, options.seed, show), torture_copies(show)], begun_s
+    )
     begun_s = time.monotonic()
     wrong += told("messages", torture_messages(options.messages, options.seed, show), begun_s)
     begun_s = time.monotonic()

@@ -291,6 +291,42 @@ def torture_files(pieces: int, seed: int, show: Callable[[str], None]) -> list[O
     return outcomes
 
 
+def torture_copies(show: Callable[[str], None]) -> Outcomes:
+    """Copy a store file by file while it is written, a step between any two files: it holds all that was acknowledged, or is
+    refused."""
+    outcome = Outcomes("copies of a running store")
+    with tempfile.TemporaryDirectory() as scratch:
+        for begun, is_reversed in itertools.product(range(1, len(STEPS)), (False, True)):
+            folder, copy = (
+                Path(scratch) / f"{begun}-{is_reversed}",
+                Path(scratch) / f"copy-{begun}-{is_reversed}",
+            )
+            driven, steps = Driven(folder), iter(range(len(STEPS)))
+            for number in itertools.islice(steps, begun):
+                driven.do(number)
+            (copy / "default").mkdir(parents=True)
+            for file in sorted((folder / "default").iterdir(), reverse=is_reversed):
+                if not file.name.endswith("-shm"):
+                    shutil.copy(file, copy / "default")
+                    for number in itertools.islice(steps, 1):
+                        driven.do(number)
+            driven.store.close()
+            found = _reopened(copy)
+            sound = {wanted(tuple(range(n))) for n in range(begun, len(STEPS) + 1)}
+            word = (
+                "refused"
+                if found.startswith("refused")
+                else "all acknowledged"
+                if found in sound
+                else "wrong"
+            )
+            outcome.counts[word] += 1
+            if word == "wrong":
+                outcome.wrong.append(f"copied from step {begun} on, reversed {is_reversed}: {found}")
+            show(f"{outcome.name}: {dict(outcome.counts)}")
+    return outcome
+
+
 def _stores(scratch: Path) -> Iterator[tuple[str, Path]]:
     """The same map as a kill leaves it, all in the logs, and after a clean end, all in the files."""
     driven = Driven(scratch / "served")

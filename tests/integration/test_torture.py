@@ -11,7 +11,7 @@ import pytest
 from benchmarks import torture_store
 from benchmarks.torture import run_calls
 from benchmarks.torture_messages import mutated, torture_messages
-from benchmarks.torture_store import STEPS, Driven, digest, torture_files, wanted
+from benchmarks.torture_store import STEPS, Driven, digest, torture_copies, torture_files, wanted
 
 
 @pytest.mark.slow
@@ -45,6 +45,12 @@ def test_damage_is_told_or_harmless() -> None:
     assert len(outcomes) > 8
     assert [line for outcome in outcomes for line in outcome.wrong] == []
     assert {word for outcome in outcomes for word in outcome.counts} == {"the same map", "refused"}
+
+
+def test_a_copy_of_a_running_store_is_whole_or_refused() -> None:
+    outcome = torture_copies(lambda line: None)
+    assert outcome.wrong == []
+    assert set(outcome.counts) == {"refused", "all acknowledged"}
 
 
 def test_hostile_messages_get_typed_answers() -> None:
