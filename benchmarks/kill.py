@@ -30,9 +30,9 @@ from potserver.domain.map_state import MapState
 from potserver.domain.types import KernelSet, Scan, yaw_pose
 from potserver.mapping.service import MappingService
 from potserver.mapping.settings import MappingSettings
+from potserver.storage.agreement import JOURNAL, TILES
 from potserver.storage.journal import Journal
 from potserver.storage.map_file import read_map
-from potserver.storage.map_store import JOURNAL, TILES
 
 _BASE_NS = 1_700_000_000_000_000_000
 _MAPPING = {"max_range_m": 15.0, "beams_per_scan": 400}

@@ -38,7 +38,7 @@ class IntakeSettings:
 
     max_queued: Annotated[int, "clouds that may wait, each map; one more is refused at once"] = 16
     robots: Annotated[tuple[str, ...], "robots that may send; none named: every legal id"] = ()
-    allow_old_stamps: Annotated[bool, "take clouds that are not newer than the robot's last accepted one"] = (
+    allow_repeats: Annotated[bool, "take clouds whose number is not above the last one of their session"] = (
         False
     )
     max_future_s: Annotated[
@@ -79,6 +79,7 @@ class StoreSettings:
     fsync: Annotated[bool, "wait for the disk with each cloud; else a power cut may take the last ones"] = (
         True
     )
+    read_only: Annotated[bool, "answer from what is kept, write nothing, and take no clouds"] = False
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -128,6 +129,7 @@ class Settings:
 _RENAMED = {
     "mapping.fine_m": "mapping.resolution_m",
     "mapping.gap_m": "mapping.free_gap_m",
+    "intake.allow_old_stamps": "intake.allow_repeats",
 }
 _NOW_FIXED = {
     "": ("seed", "stats_period_s"),
@@ -368,5 +370,6 @@ def _check(s: Settings) -> None:
         not s.atoms.save or s.dictionary is not None,
         "the setting `dictionary` beside it: the built-in atoms belong to the program",
     )
+    need("store.read_only", not (s.store.read_only and s.store.directory == ""), "a store to read from")
     need("log.level", s.log.level in ("debug", "info", "warning", "error"), "debug, info, warning or error")
     need("log.format", s.log.format in ("auto", "json", "console"), "auto, json or console")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import collections
 import contextlib
 import time
-from collections.abc import Mapping
 from typing import NamedTuple, Protocol
 
 import zenoh
@@ -22,10 +21,10 @@ from potserver.adapters.questions.control import ControlQueryable
 from potserver.adapters.questions.question import Served
 from potserver.adapters.questions.registry import QUESTIONS
 from potserver.adapters.receipts import ReceiptSender
-from potserver.adapters.stamps import StampOrder
-from potserver.adapters.writer import Keeper, MapWriter
+from potserver.adapters.writer import Bounds, Keeper, MapWriter
 from potserver.atoms.store import AtomStore
 from potserver.config import Settings
+from potserver.domain.order import CloudOrder, Heard
 from potserver.errors import ShuttingDownError
 from potserver.health import Health
 from potserver.log import get_logger
@@ -62,15 +61,13 @@ class MapNode:
     control and robots' tokens.
     """
 
-    def __init__(
-        self, mapper: MappingService, keeper: Keeper, newest_stamps: Mapping[str, int], shared: Shared
-    ) -> None:
+    def __init__(self, mapper: MappingService, keeper: Keeper, heard: Heard, shared: Shared) -> None:
         """Declare everything, and begin to work.
 
         Args:
             mapper: Of the map.
             keeper: Where the map survives.
-            newest_stamps: Of its robots, ns, from before.
+            heard: The last numbers of its robots, from before.
             shared: With the other maps of the server.
         """
         settings, limits, health = shared.settings, shared.settings.limits, shared.health
@@ -100,12 +97,8 @@ class MapNode:
         writer = MapWriter(
             mapper,
             keeper,
-            stamps=StampOrder(
-                newest_stamps,
-                allow_old=settings.intake.allow_old_stamps,
-                max_future_s=settings.intake.max_future_s,
-                max_robots=limits.max_robots,
-            ),
+            order=CloudOrder(heard, allow_repeats=settings.intake.allow_repeats),
+            bounds=Bounds(settings.intake.max_future_s, limits.max_coordinate_m, limits.max_map_bytes),
             intake=self.intake,
             reader=CloudReader(limits, poses, frozenset(settings.intake.robots)),
             receipts=self._receipts,

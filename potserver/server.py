@@ -28,12 +28,14 @@ from potserver.adapters.stats import StatsPublisher, stats_now
 from potserver.atoms.store import AtomStore
 from potserver.config import Settings, as_tree
 from potserver.domain.dictionary import AtomDictionary
+from potserver.domain.order import Heard
 from potserver.health import Health
 from potserver.log import get_logger
 from potserver.mapping.service import MappingService
 from potserver.node import FLUSH_S, QUEUE_MESSAGES, MapNode, Shared
 from potserver.numerics.threads import default_threads
 from potserver.storage.map_store import MapStore, MemoryOnly
+from potserver.storage.read_only import ReadOnlyStore
 from potserver.web.listener import Served, WebListener
 
 log = get_logger("potserver.server")
@@ -73,7 +75,7 @@ class MapServer:
         self.nodes: dict[str, MapNode] = {}  # by map id; to look at
         self.pool: QueryPool | None = None
         self._stats: StatsPublisher | None = None
-        self._stores: dict[str, MapStore] = {}
+        self._stores: dict[str, MapStore | ReadOnlyStore] = {}
         self.web: WebListener | None = None
         self._stopping = threading.Event()
         self._lock = threading.Lock()  # start and stop, one at a time
@@ -183,7 +185,7 @@ class MapServer:
         mappers = [self._make_map(map_id) for map_id in s.maps]
         config = build_config(s.zenoh, root=s.root, wire_guard_bytes=s.limits.wire_guard_bytes)
         try:
-            stamps = [self._open_store(mapper) for mapper in mappers]
+            heard = [self._open_store(mapper) for mapper in mappers]
             self._session, self._endpoints = open_session(config)
         except BaseException:
             self._close_stores()
@@ -195,7 +197,7 @@ class MapServer:
                 others.refuse()
                 _warm_up(mappers[0])  # all maps share the compiled numerics
                 others.refuse()  # one that was warming up beside us
-            self._serve(self._session, mappers, stamps)
+            self._serve(self._session, mappers, heard)
         except BaseException:
             self._teardown(0.0)
             raise
@@ -207,9 +209,7 @@ class MapServer:
             store=s.store.directory or "memory only",
         )
 
-    def _serve(
-        self, session: zenoh.Session, mappers: list[MappingService], stamps: list[dict[str, int]]
-    ) -> None:
+    def _serve(self, session: zenoh.Session, mappers: list[MappingService], heard: list[Heard]) -> None:
         """Declare everything, and last say that the maps are there."""
         s = self.settings
         self.pool = QueryPool(
@@ -218,27 +218,28 @@ class MapServer:
             max_queued_bytes=QUEUE_MESSAGES * s.limits.max_query_bytes,
         )
         shared = Shared(s, session, self.pool, _atom_store(mappers, s), self.health)
-        for mapper, newest in zip(mappers, stamps, strict=True):
+        for mapper, numbers in zip(mappers, heard, strict=True):
             keeper = self._stores.get(mapper.map_id, MemoryOnly())
-            self.nodes[mapper.map_id] = MapNode(mapper, keeper, newest, shared)
+            self.nodes[mapper.map_id] = MapNode(mapper, keeper, numbers, shared)
         self._stats = StatsPublisher(session, keys.stats_key(s.root, s.server_id), self.stats, s.limits)
         for node in self.nodes.values():
             node.announce(s.server_id)
 
-    def _open_store(self, mapper: MappingService) -> dict[str, int]:
-        """Give a map what was kept of it; the newest stamps of its robots."""
+    def _open_store(self, mapper: MappingService) -> Heard:
+        """Give a map what was kept of it; the last numbers of its robots."""
         s = self.settings.store
         if not s.directory:
             return {}
-        store = MapStore(
-            Path(s.directory).expanduser(),
-            mapper.map_id,
-            keeps_evidence=mapper.keeps_evidence,
-            health=self.health,
-            fsync=s.fsync,
-        )
+        folder, map_id = Path(s.directory).expanduser(), mapper.map_id
+        store: MapStore | ReadOnlyStore
+        if s.read_only:
+            store = ReadOnlyStore(folder, map_id, keeps_evidence=mapper.keeps_evidence, health=self.health)
+        else:
+            store = MapStore(
+                folder, map_id, keeps_evidence=mapper.keeps_evidence, health=self.health, fsync=s.fsync
+            )
         self._stores[mapper.map_id] = store
-        return store.restore(mapper).stamps
+        return store.restore(mapper).heard
 
     def _close_stores(self) -> bool:
         stores, self._stores = self._stores, {}

@@ -201,7 +201,7 @@ def test_the_tree_is_plain() -> None:
 
 def test_an_operator_meets_few_settings_each_with_a_description() -> None:
     leaves = describe(Settings())
-    assert len(leaves) <= 45
+    assert len(leaves) <= 48
     assert sum(leaf.path.startswith("mapping.") for leaf in leaves) <= 14
     assert len({leaf.path for leaf in leaves}) == len(leaves)
     for leaf in leaves:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import logging
+import secrets
 import threading
 import time
 from collections.abc import Iterator
@@ -31,6 +32,7 @@ class Clouds:
     def __init__(self, link: Link, options: FeedOptions) -> None:
         self._link, self._options = link, options
         self.on_receipt = options.on_receipt
+        self.session = secrets.token_hex(8)
         self._lock = threading.RLock()
         self._feeds: dict[str, Feed] = {}
         self._numberings: dict[str, Numbering] = {}
@@ -50,7 +52,7 @@ class Clouds:
         """See `MapClient.integrate`."""
         assert cloud.robot is not None
         number, stamp_ns = self._numbering(cloud.robot).assign(seq, stamp_ns)
-        cloud = msgspec.structs.replace(cloud, seq=number, stamp_ns=stamp_ns)
+        cloud = msgspec.structs.replace(cloud, seq=number, stamp_ns=stamp_ns, session=self.session)
         started = time.monotonic()
         reply = self._link.ask("integrate", cloud, messages.Receipt, timeout_s)
         receipt = Receipt(reply, round_trip_s=time.monotonic() - started)
@@ -72,6 +74,7 @@ class Clouds:
         if wait and timeout_s is None:
             timeout_s = 2.0 * self._options.receipt_timeout_s
         feed = self._feed(cloud.robot)
+        cloud = msgspec.structs.replace(cloud, session=self.session)
         return feed.offer(cloud, seq=seq, stamp_ns=stamp_ns, wait=wait, timeout_s=timeout_s)
 
     def pose(self, T_map_sensor: ArrayLike, *, stamp_ns: int | None, robot: str) -> None:

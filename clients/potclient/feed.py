@@ -53,7 +53,7 @@ def first_number() -> int:
 
 
 class Numbering:
-    """The numbers and stamps of one robot's clouds; both only ever grow.
+    """The numbers of one robot's clouds, which only ever grow, and their stamps.
 
     Args:
         first: The first number; None takes one that no other process has.
@@ -62,16 +62,13 @@ class Numbering:
     def __init__(self, first: int | None = None) -> None:
         self._lock = threading.Lock()
         self._seq = (first_number() if first is None else first) - 1
-        self._stamp_ns = 0
 
     def assign(self, seq: int | None, stamp_ns: int | None) -> tuple[int, int]:
         """The number and stamp to send, chosen where they are None: the next number, the clock."""
         with self._lock:
             chosen_seq = self._seq + 1 if seq is None else seq
-            chosen_stamp = max(time.time_ns(), self._stamp_ns + 1) if stamp_ns is None else stamp_ns
             self._seq = max(self._seq, chosen_seq)
-            self._stamp_ns = max(self._stamp_ns, chosen_stamp)
-            return chosen_seq, chosen_stamp
+            return chosen_seq, time.time_ns() if stamp_ns is None else stamp_ns
 
 
 class _Sent:

@@ -13,6 +13,7 @@ import zenoh
 from potclient import zenoh_config
 from potclient.errors import NoServerError, UsageError
 from potclient.zenoh_config import DEFAULT_ENDPOINT
+from potschemas.redaction import holds_secret, is_secret
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -156,5 +157,10 @@ def parse_overrides(values: Sequence[str]) -> tuple[tuple[str, str], ...]:
         key, colon, json5 = value.partition(":")
         if not colon or not key.strip():
             raise UsageError(f"--cfg {value!r}: need KEY:VALUE, e.g. transport/link/tx/lease:5000")
+        if holds_secret(value) or is_secret(key.strip()):
+            raise UsageError(
+                f"--cfg {key}: a secret in the command line can be read by every user of this machine. Write it into a Zenoh"
+                " configuration file that only you may read (chmod 600), and name that with --config or ZENOH_CONFIG"
+            )
         pairs.append((key.strip(), json5.strip()))
     return tuple(pairs)

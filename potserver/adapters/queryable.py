@@ -15,10 +15,11 @@ import numpy as np
 import zenoh
 
 from potschemas import keys
+from potserver.adapters.audit import Audit
 from potserver.adapters.key_exprs import last_chunk
 from potserver.adapters.query_pool import QueryJob, QueryPool
 from potserver.adapters.questions.question import Asked, Question, Served
-from potserver.adapters.replies import BUG, INTEGRATE, check_query, payload_of, reply, reply_error
+from potserver.adapters.replies import BUG, INTEGRATE, asker_of, check_query, payload_of, reply, reply_error
 from potserver.codec.base import decode, encode
 from potserver.errors import DeadlineError, PotserverError, ShuttingDownError, UnsupportedError
 from potserver.log import get_logger
@@ -91,6 +92,7 @@ class MapQueryable(Queryable):
         self._keys, self._served, self._pool = map_keys, served, pool
         self._questions, self._integrate = {question.op: question for question in questions}, integrate
         self._ops = (INTEGRATE, *self._questions)
+        self._audit = Audit(map_keys.map_id)
         super().__init__(session, map_keys.query("*"), backlog=_BACKLOG)
 
     def admit(self, query: zenoh.Query) -> None:
@@ -158,9 +160,7 @@ class MapQueryable(Queryable):
         chunk = last_chunk(query.key_expr)
         op = chunk if chunk in self._ops else "unknown"
         self._served.health.count(f"queries.{op}.{error.code}")
-        log.debug(
-            "query_refused", map_id=self._keys.map_id, op=op, reason=error.code, detail=str(error)[:300]
-        )
+        self._audit.refused(f"q/{op}", asker_of(query), error)
         reply_error(query, error)
 
 

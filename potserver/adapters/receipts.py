@@ -7,18 +7,17 @@ transfer. When the bulk outbox is full, parameters are dropped and counted (`par
 
 from __future__ import annotations
 
-import math
 import time
-from collections.abc import Callable
 from typing import NamedTuple
 
 import zenoh
 
 from potschemas import messages
 from potschemas.keys import MapKeys
+from potserver.adapters.audit import Audit
 from potserver.adapters.intake import CloudJob, IntakeQueue
 from potserver.adapters.outbox import End, Outbox
-from potserver.adapters.replies import INTEGRATE, reply, reply_error
+from potserver.adapters.replies import INTEGRATE, asker_of, reply, reply_error
 from potserver.codec.base import Wire, encode
 from potserver.codec.clouds import UNKNOWN_SEQ, decode_cloud_head
 from potserver.codec.kernels import encode_kernels
@@ -27,10 +26,7 @@ from potserver.domain.types import MapUpdate, Scan, TileChange
 from potserver.errors import PotserverError, TooLargeError
 from potserver.health import Health
 from potserver.limits import Limits
-from potserver.log import get_logger
 from potserver.mapping.service import MappingService
-
-log = get_logger("potserver.receipts")
 
 _MAX_TILES = 10_000  # in one tick: more than a receiver decodes at once
 
@@ -61,7 +57,7 @@ class ReceiptSender:
         self._mapper, self._intake, self._health = mapper, intake, health
         self._max_bytes = limits.max_cloud_bytes
         self._prompt, self._bulk = prompt, bulk
-        self._reported_s: dict[str, float] = {}
+        self._audit = Audit(keys.map_id)
 
     def accept(
         self, job: CloudJob, scan: Scan, update: MapUpdate, *, wait_ms: float, integrate_ms: float
@@ -126,14 +122,7 @@ class ReceiptSender:
 
         def send() -> None:
             seq = UNKNOWN_SEQ if payload is None else decode_cloud_head(payload.to_bytes()).seq
-            self._report(error)(
-                "scan_refused",
-                map_id=self._keys.map_id,
-                robot_id=robot_id,
-                seq=seq,
-                reason=error.code,
-                detail=str(error),
-            )
+            self._audit.refused("cloud", robot_id, error, seq=seq)
             wire = encode_refused(self._keys.map_id, robot_id, seq, error, waited, state)
             self._put(self._keys.receipt(robot_id), wire, zenoh.Priority.DATA_HIGH)
 
@@ -149,6 +138,7 @@ class ReceiptSender:
 
     def _refuse_query(self, query: zenoh.Query, error: PotserverError) -> None:
         """Knows nothing of the cloud, whose bytes can go at once."""
+        self._audit.refused("integrate", asker_of(query), error)
 
         def send() -> None:
             with query:
@@ -158,14 +148,6 @@ class ReceiptSender:
 
     def _count_receipt(self, end: End) -> None:
         self._health.count(f"receipts.{end.value}")
-
-    def _report(self, error: PotserverError) -> Callable[..., None]:
-        """One line a second and reason; the counters have them all."""
-        now_s = time.monotonic()
-        if now_s - self._reported_s.get(error.code, -math.inf) < 1.0:
-            return log.debug
-        self._reported_s[error.code] = now_s
-        return log.info
 
     def _put(self, key: str, wire: Wire, priority: zenoh.Priority) -> None:
         self._session.put(
@@ -231,6 +213,7 @@ def encode_refused(
             wait_ms=waited.wait_ms,
             map_revision=state.map_revision,
             map_kernels=len(state.snapshot),
+            next_seq=messages.ABSENT if error.next_seq is None else error.next_seq,
         )
     )
 

@@ -26,6 +26,12 @@ def check_query(query: zenoh.Query, kind: type[messages.Message], max_bytes: int
     return n_bytes
 
 
+def asker_of(query: zenoh.Query) -> str:
+    """The Zenoh session that asks, as far as the query says so; empty if it does not."""
+    source = query.source_info
+    return "" if source is None else str(source.source_id.zid)
+
+
 def payload_of(query: zenoh.Query) -> bytes:
     """Its bytes; none are an empty payload."""
     return b"" if query.payload is None else query.payload.to_bytes()

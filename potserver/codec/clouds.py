@@ -93,6 +93,7 @@ def decode_cloud(payload: bytes, *, robot_id: str | None, limits: Limits, pose_a
     _check_placed(xyz, pose, limits.max_coordinate_m)
     return Scan(
         robot_id=sender,
+        session="" if cloud.session is messages.ABSENT else cloud.session,
         seq=cloud.seq,
         stamp_ns=cloud.stamp_ns,
         points=xyz,
@@ -112,6 +113,7 @@ def encode_cloud(scan: Scan) -> bytes:
             T_map_sensor=wire.encode_array(scan.T_map_sensor),
             is_return=None if scan.is_return.all() else wire.encode_array(scan.is_return),
             robot=scan.robot_id,
+            session=scan.session or messages.ABSENT,
         )
     )
 

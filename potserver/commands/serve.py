@@ -41,6 +41,7 @@ examples:
   potserver serve --map ground --map first_floor         two maps, each with its own writer
   potserver serve --listen tcp/127.0.0.1:0               any free port; the log says which
   potserver serve --store /var/lib/site/maps             keep the maps there; --in-memory: forget them at the end
+  potserver serve --read-only                            answer from the kept maps, write nothing: for a sick disk
   potserver serve --connect tcp/router:7447 --listen tcp/127.0.0.1:7448
                                                          join a Zenoh router (ROS 2 hosts have one on 7447)
   potserver serve --web 127.0.0.1:8080                   a page with the map; /live, /ready, /metrics (Prometheus)

@@ -34,6 +34,7 @@ class Scan:
     is_return: Bool = None  # type: ignore[assignment]  # (N,) false = no echo, the beam was free up to the point; all by default
     is_planar: bool = False  # a 2D scanner: everything has z = 0
     robot_id: str = "robot"
+    session: str = ""  # the run of the robot's program that counts `seq`
     seq: int = 0
     stamp_ns: int = 0
 

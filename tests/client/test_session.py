@@ -86,3 +86,10 @@ def build_config_with_environment(monkeypatch: pytest.MonkeyPatch, file: Path) -
 def test_endpoints_that_are_none_are_refused(endpoint: str) -> None:
     with pytest.raises(UsageError, match="PROTOCOL/ADDRESS"):
         build_config(SessionOptions(connect=(endpoint,)))
+
+
+def test_a_secret_in_the_command_line_is_refused_with_the_way_to_do_it() -> None:
+    for given in ("transport/auth/usrpwd/password:hush", 'transport/auth:{usrpwd:{password:"hush"}}'):
+        with pytest.raises(UsageError, match="ZENOH_CONFIG") as refused:
+            options_of("--cfg", given)
+        assert "hush" not in str(refused.value)

@@ -196,13 +196,13 @@ def test_a_message_without_an_encoding_is_taken_for_what_its_key_says(real_clien
     assert isinstance(answer, messages.Occupancy)
 
 
-def test_an_old_stamp_is_refused_and_a_newer_one_is_not(real_client: Client) -> None:
+def test_an_old_number_is_refused_and_a_higher_one_is_not(real_client: Client) -> None:
     first = real_client.one("integrate", make_cloud(seq=50, robot="clock"))
     for seq in (50, 49):
-        assert real_client.error("integrate", make_cloud(seq=seq, robot="clock")).code is ErrorCode.OLD_STAMP
+        assert real_client.error("integrate", make_cloud(seq=seq, robot="clock")).code is ErrorCode.OLD_SEQ
     receipts = real_client.receipts("clock")
     real_client.put_cloud(make_cloud(seq=50), robot="clock")
-    assert receipts.get(timeout=30).reason == "old_stamp"
+    assert receipts.get(timeout=30).reason == "old_seq"
     assert real_client.one("info").map_revision == first.map_revision
     assert real_client.one("integrate", make_cloud(seq=51, robot="clock")).map_revision > first.map_revision
 

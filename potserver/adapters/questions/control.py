@@ -10,12 +10,13 @@ import numpy as np
 import zenoh
 
 from potschemas import keys, messages
+from potserver.adapters.audit import Audit
 from potserver.adapters.intake import Barrier, IntakeQueue
 from potserver.adapters.key_exprs import is_wild, last_chunk
 from potserver.adapters.outbox import Outbox
 from potserver.adapters.queryable import Queryable
 from potserver.adapters.questions.question import Served
-from potserver.adapters.replies import BUG, check_query, payload_of, reply, reply_error
+from potserver.adapters.replies import BUG, asker_of, check_query, payload_of, reply, reply_error
 from potserver.adapters.writer import MapWriter
 from potserver.codec.base import decode, encode
 from potserver.codec.clouds import decode_transform
@@ -119,6 +120,7 @@ class ControlQueryable(Queryable):
         """
         self._keys, self._served, self._intake, self._writer = map_keys, served, intake, writer
         self._withdraw, self._prompt = withdraw, prompt
+        self._audit = Audit(map_keys.map_id)
         super().__init__(session, map_keys.control("*"))
 
     def admit(self, query: zenoh.Query) -> None:
@@ -141,7 +143,9 @@ class ControlQueryable(Queryable):
                     raise DeadlineError(
                         f"{verb}: {request.timeout_s} s passed before the clouds ahead of it were mapped"
                     )
-                self._done(query, verb, work())
+                message = work()
+                self._audit.changed(f"ctl/{verb}", asker_of(query), result=message)
+                self._done(query, verb, message)
             except PotserverError as error:
                 self.refuse(query, error)
             except Exception:
@@ -173,6 +177,7 @@ class ControlQueryable(Queryable):
         """Count what is wrong; the outbox sends it."""
         verb = last_chunk(query.key_expr)
         self._served.health.count(f"control.{verb if verb in VERBS else 'unknown'}.{error.code}")
+        self._audit.refused(f"ctl/{verb if verb in VERBS else 'unknown'}", asker_of(query), error)
 
         def send() -> None:
             with query:
