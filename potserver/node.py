@@ -11,7 +11,8 @@ from typing import NamedTuple, Protocol
 import zenoh
 
 from potschemas import keys
-from potserver.adapters.clouds import CloudDoor, CloudReader, CloudSubscriber
+from potserver.adapters.answers import Answers
+from potserver.adapters.clouds import CloudDoor, CloudReader, CloudSubscriber, IntegrateQueryable
 from potserver.adapters.intake import IntakeQueue
 from potserver.adapters.outbox import Outbox
 from potserver.adapters.poses import WAIT_S, PoseBuffer, PoseSubscriber
@@ -107,7 +108,7 @@ class MapNode:
                 max_robots=limits.max_robots,
             ),
             intake=self.intake,
-            reader=CloudReader(limits, poses, frozenset(settings.intake.robots)),
+            reader=CloudReader(limits, poses),
             receipts=self._receipts,
             health=health,
         )
@@ -135,21 +136,17 @@ class MapNode:
             limits=limits,
             durable=durable,
         )
+        answers = Answers(served, shared.pool, deadline_s=settings.queries.deadline_s)
         return [
             PoseSubscriber(session, map_keys, poses=poses, health=health, allowed_robots=allowed),
             CloudSubscriber(session, map_keys, door),
-            MapQueryable(
-                session,
-                map_keys,
-                questions=QUESTIONS,
-                integrate=door.admit_query,
-                served=served,
-                pool=shared.pool,
-            ),
+            IntegrateQueryable(session, map_keys, door, health),
+            MapQueryable(session, map_keys, questions=QUESTIONS, answers=answers, health=health),
             ControlQueryable(
                 session,
                 map_keys,
                 served=served,
+                answers=answers,
                 intake=self.intake,
                 writer=writer,
                 withdraw=self.withdraw,

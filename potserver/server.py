@@ -20,7 +20,7 @@ from types import TracebackType
 import zenoh
 
 from potschemas import __version__, keys, messages
-from potserver.adapters.presence import OtherServers
+from potserver.adapters.presence import AskerWatch, OtherServers
 from potserver.adapters.query_pool import QueryPool
 from potserver.adapters.questions.registry import warm_up
 from potserver.adapters.session import build_config, close_session, open_session
@@ -73,6 +73,7 @@ class MapServer:
         self.nodes: dict[str, MapNode] = {}  # by map id; to look at
         self.pool: QueryPool | None = None
         self._stats: StatsPublisher | None = None
+        self._askers: AskerWatch | None = None
         self._stores: dict[str, MapStore] = {}
         self.web: WebListener | None = None
         self._stopping = threading.Event()
@@ -217,6 +218,7 @@ class MapServer:
             max_queued=s.queries.max_queued,
             max_queued_bytes=QUEUE_MESSAGES * s.limits.max_query_bytes,
         )
+        self._askers = AskerWatch(session, self.pool.give_up)
         shared = Shared(s, session, self.pool, _atom_store(mappers, s), self.health)
         for mapper, newest in zip(mappers, stamps, strict=True):
             keeper = self._stores.get(mapper.map_id, MemoryOnly())
@@ -271,8 +273,9 @@ class MapServer:
         # subscribers live on through the drain, so that whoever still sends is told
         drained = [node.drain(deadline) for node in nodes]
         answered = self.pool is None or self.pool.close(FLUSH_S)
-        if self._stats is not None:
-            self._stats.close()
+        for part in (self._stats, self._askers):
+            if part is not None:
+                part.close()
         ended = [node.close() for node in nodes]
         kept = self._close_stores()  # after the writers: a last snapshot of what they made
         clean = all([*drained, answered, *ended, kept, close_session(session, _CLOSE_S), self._close_web()])

@@ -48,11 +48,13 @@ class Clouds:
         self, cloud: messages.Cloud, *, seq: int | None, stamp_ns: int | None, timeout_s: float | None
     ) -> Receipt:
         """See `MapClient.integrate`."""
-        assert cloud.robot is not None
-        number, stamp_ns = self._numbering(cloud.robot).assign(seq, stamp_ns)
+        robot = cloud.robot
+        assert robot is not None
+        number, stamp_ns = self._numbering(robot).assign(seq, stamp_ns)
         cloud = msgspec.structs.replace(cloud, seq=number, stamp_ns=stamp_ns)
         started = time.monotonic()
-        reply = self._link.ask("integrate", cloud, messages.Receipt, timeout_s)
+        key = self._link.keys.integrate(robot)
+        reply = self._link.ask(key, cloud, messages.Receipt, timeout_s)
         receipt = Receipt(reply, round_trip_s=time.monotonic() - started)
         if (error := receipt.error()) is not None:
             raise error

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import itertools
 import logging
 import math
 import threading
@@ -42,6 +43,7 @@ MessageT = TypeVar("MessageT", bound=Message)
 _JOIN_S = 3.0  # for callbacks that still run when a link is closed
 _DIAGNOSIS_TIMEOUT_S = 0.5  # how long a silent question waits for the tokens of servers
 # megabytes take lanes of their own, so that they do not delay short questions and answers on the same link
+_BULK_BYTES = 65_536  # of a question
 _BULK_LANES = {
     "integrate": zenoh.Priority.DATA_LOW,
     "grid": zenoh.Priority.DATA,
@@ -113,7 +115,10 @@ class Link:
         self._lock = threading.RLock()
         self._alive: set[tuple[str, str]] = set()  # (server, map) of every liveliness token under the root
         self._servers_changed = threading.Condition()
-        self._queriers: dict[str, zenoh.Querier] = {}
+        self._queriers: dict[
+            tuple[str, bool], zenoh.Querier
+        ] = {}  # by key, and whether it is for large questions
+        self._numbers = itertools.count()  # of questions
         self._declared: list[Any] = []
         self._subscriptions: list[Subscription] = []
         self._readers: weakref.WeakSet[Subscription] = weakref.WeakSet()  # all whose threads may still run
@@ -216,11 +221,11 @@ class Link:
 
     # --- questions -----------------------------------------------------------------------------------------------------------
 
-    def ask(self, op: str, request: Message, kind: type[MessageT], timeout_s: float | None) -> MessageT:
-        """The only reply to a question of the map: `points`, `grid`, ...
+    def ask(self, key: str, request: Message, kind: type[MessageT], timeout_s: float | None) -> MessageT:
+        """The only reply to a question.
 
         Args:
-            op: Which question.
+            key: What is asked: `keys.query("points")`, ...
             request: Its message.
             kind: Of the reply.
             timeout_s: For the reply; None = the link's.
@@ -230,27 +235,36 @@ class Link:
             BadReplyError: the reply is not of that kind.
             UsageError, ClosedError: nothing was asked.
         """
-        return next(self.stream(op, request, kind, timeout_s))
+        return next(self.stream(key, request, kind, timeout_s))
 
     def stream(
-        self, op: str, request: Message, kind: type[MessageT], timeout_s: float | None
+        self, key: str, request: Message, kind: type[MessageT], timeout_s: float | None
     ) -> Iterator[MessageT]:
         """Ask now; the iterator gives the replies as they come, at least one. Arguments and errors as for `ask`."""
-        samples = self.samples(self.keys.query(op), request, timeout_s)
+        samples = self.samples(key, request, timeout_s)
         return (decoded(sample.payload, kind) for sample in samples)
 
     def samples(self, key: str, request: Message, timeout_s: float | None) -> Iterator[zenoh.Sample]:
-        """Ask now, on any key; the iterator gives the replies as they come, undecoded. Errors as for `ask`."""
+        """Ask now; the iterator gives the replies as they come, undecoded. Errors as for `ask`."""
         timeout_s = self.timeout_s if timeout_s is None else timeout_s
         if not (math.isfinite(timeout_s) and timeout_s > 0):
             raise UsageError(f"timeout_s {timeout_s}: need a positive number of seconds")
         was_ready = bool(self.servers)
-        sent: dict[str, Any] = {"payload": encode(request), "encoding": encoding_of(request)}
+        payload = encode(request)
+        is_bulk = len(payload) > _BULK_BYTES
+        querier = self._querier(key, is_bulk=is_bulk)
+        sent: dict[str, Any] = {
+            "payload": payload,
+            "encoding": encoding_of(request),
+            # the server gives each session its share, and ends the questions of one that is gone
+            "source_info": zenoh.SourceInfo(querier.id, next(self._numbers)),
+        }
         if timeout_s == self.timeout_s:
-            replies = self._call(self._querier(key).get, **sent)
+            replies = self._call(querier.get, **sent)
         else:  # the time-out of a declared querier is fixed
-            replies = self._call(self._session.get, key, timeout=timeout_s, **sent, **_query_qos(key))
-        for_silence = functools.partial(self._silence, key, len(sent["payload"]), was_ready)
+            qos = _query_qos(key, is_bulk=is_bulk)
+            replies = self._call(self._session.get, key, timeout=timeout_s, **sent, **qos)
+        for_silence = functools.partial(self._silence, key, len(payload), was_ready)
         return self._checked(replies, key, timeout_s, for_silence)
 
     def deadline_ms(self, timeout_s: float | None) -> float:
@@ -319,13 +333,14 @@ class Link:
             " filter, or the server failed while answering"
         )
 
-    def _querier(self, key: str) -> zenoh.Querier:
+    def _querier(self, key: str, *, is_bulk: bool = False) -> zenoh.Querier:
         with self._lock:
             self.check_open()
-            querier = self._queriers.get(key)
+            querier = self._queriers.get((key, is_bulk))
             if querier is None:
-                querier = self._session.declare_querier(key, timeout=self.timeout_s, **_query_qos(key))
-                self._queriers[key] = querier
+                qos = _query_qos(key, is_bulk=is_bulk)
+                querier = self._session.declare_querier(key, timeout=self.timeout_s, **qos)
+                self._queriers[key, is_bulk] = querier
                 self._declared.append(querier)
             return querier
 
@@ -421,9 +436,10 @@ def decoded(payload: zenoh.ZBytes, kind: type[MessageT]) -> MessageT:
         raise BadReplyError(f"{error}; do the versions of client and server differ?") from error
 
 
-def _query_qos(key: str) -> dict[str, Any]:
+def _query_qos(key: str, *, is_bulk: bool) -> dict[str, Any]:
     """The lane of a question; its replies take the same one. No consolidation: parts of one reply share a key."""
-    priority = _BULK_LANES.get(key.rsplit("/", 1)[-1], zenoh.Priority.INTERACTIVE_HIGH)
+    usual = zenoh.Priority.DATA if is_bulk else zenoh.Priority.INTERACTIVE_HIGH
+    priority = _BULK_LANES.get(key.rsplit("/", 1)[-1], usual)
     return {
         "consolidation": zenoh.ConsolidationMode.NONE,
         "congestion_control": zenoh.CongestionControl.BLOCK,

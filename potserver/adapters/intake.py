@@ -11,9 +11,9 @@ from typing import NamedTuple
 
 import zenoh
 
+from potserver.adapters.fairness import Bounds, make_room
 from potserver.errors import OverloadedError, PotserverError, ShuttingDownError
 
-INTEGRATE_LANE = ""  # all `q/integrate` clouds: whose they are is only known once they are decoded
 RETRY_AFTER_S = 0.5  # what a refused sender is advised to wait: about as long as a scan takes to map
 _MAX_BARRIERS = 16
 
@@ -22,9 +22,9 @@ _MAX_BARRIERS = 16
 class CloudJob:
     """One cloud, not decoded yet."""
 
-    robot_id: str | None  # from the key; None: `q/integrate`, the message says it
+    robot_id: str  # from the key; it may not be a legal id
     payload: zenoh.ZBytes
-    query: zenoh.Query | None = None  # `q/integrate` only: the receipt is its reply
+    query: zenoh.Query | None = None  # `in/<robot>/integrate`: the receipt is its reply
     arrived_s: float = dataclasses.field(default_factory=time.monotonic)
     n_bytes: int = dataclasses.field(init=False)
 
@@ -34,7 +34,7 @@ class CloudJob:
     @property
     def lane(self) -> str:
         """What fairness is between."""
-        return INTEGRATE_LANE if self.robot_id is None else self.robot_id
+        return self.robot_id
 
     def wait_ms(self) -> float:
         """Time since the cloud arrived."""
@@ -81,7 +81,7 @@ class IntakeQueue:
     def __init__(
         self, *, max_queued: int, max_queued_bytes: int, retry_after_s: float = RETRY_AFTER_S
     ) -> None:
-        self._max_queued, self._max_bytes, self._retry_after_s = max_queued, max_queued_bytes, retry_after_s
+        self._bounds, self._retry_after_s = Bounds(max_queued, max_queued_bytes), retry_after_s
         self._changed = threading.Condition()
         self._epochs: collections.deque[_Epoch] = collections.deque([_Epoch()])
         self._counts: collections.Counter[str] = collections.Counter()  # clouds of each lane
@@ -123,7 +123,7 @@ class IntakeQueue:
         with self._changed:
             if not self._admitting:
                 return [Refusal(job, ShuttingDownError("the server takes no more clouds"))]
-            victims = self._make_room(job)
+            victims = make_room(job, self._bounds, self._counts, self._sizes, self._newest_first)
             error = self._overloaded()
             if victims is None:
                 return [Refusal(job, error)]
@@ -213,29 +213,9 @@ class IntakeQueue:
     def _overloaded(self) -> OverloadedError:
         return OverloadedError(
             f"the queue holds {self._counts.total()} clouds of {self._n_bytes} bytes;"
-            f" the limits are {self._max_queued} and {self._max_bytes}",
+            f" the limits are {self._bounds.max_queued} and {self._bounds.max_bytes}",
             retry_after_s=self._retry_after_s,
         )
-
-    def _make_room(self, job: CloudJob) -> list[CloudJob] | None:
-        """Clouds whose places the newcomer may have; None if it should not, or would still not fit."""
-        counts, sizes = self._counts.copy(), self._sizes.copy()
-        newest: dict[str, Iterator[CloudJob]] = {}
-        victims: list[CloudJob] = []
-        while True:
-            lacks_bytes = sizes.total() + job.n_bytes > self._max_bytes
-            if not lacks_bytes and counts.total() + 1 <= self._max_queued:
-                return victims
-            held, wanted = (sizes, job.n_bytes) if lacks_bytes else (counts, 1)
-            if not held.total():
-                return None
-            lane = held.most_common(1)[0][0]
-            victim = next(newest.setdefault(lane, self._newest_first(lane)))
-            counts[lane] -= 1
-            sizes[lane] -= victim.n_bytes
-            if lane == job.lane or held[lane] < held[job.lane] + wanted:
-                return None
-            victims.append(victim)
 
     def _newest_first(self, lane: str) -> Iterator[CloudJob]:
         for epoch in reversed(self._epochs):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 
 import zenoh
 
@@ -13,6 +13,7 @@ from potserver.adapters.key_exprs import sender_of
 from potserver.errors import SettingsError
 from potserver.health import Health
 from potserver.log import get_logger
+from potserver.threads import spawn
 
 log = get_logger("potserver.presence")
 
@@ -99,6 +100,31 @@ class ServerToken:
     def undeclare(self) -> None:
         """Say that no more work should come here."""
         self._token.undeclare()
+
+
+class AskerWatch:
+    """Gives up the questions of sessions whose connection to us ended.
+
+    Of sessions behind a router we do not hear: deadlines end their questions. A token of the asker would travel through
+    routers, but anybody could undeclare another's.
+    """
+
+    def __init__(self, session: zenoh.Session, give_up: Callable[[str], int]) -> None:
+        self._give_up = give_up
+        self._events = session.info.declare_transport_events_listener(zenoh.handlers.FifoChannel(64))
+        self._thread = spawn("asker-watch", self._run)
+
+    def close(self) -> None:
+        """Follow no more."""
+        self._events.undeclare()
+        self._thread.join(1.0)
+
+    def _run(self) -> None:
+        for event in self._events:
+            if event.kind == zenoh.SampleKind.DELETE:
+                n = self._give_up(str(event.transport.zid))
+                if n:
+                    log.info("asker_gone", zid=str(event.transport.zid), n_questions=n)
 
 
 class RobotWatch:

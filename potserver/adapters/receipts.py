@@ -18,7 +18,7 @@ from potschemas import messages
 from potschemas.keys import MapKeys
 from potserver.adapters.intake import CloudJob, IntakeQueue
 from potserver.adapters.outbox import End, Outbox
-from potserver.adapters.replies import INTEGRATE, reply, reply_error
+from potserver.adapters.replies import reply, reply_error
 from potserver.codec.base import Wire, encode
 from potserver.codec.clouds import UNKNOWN_SEQ, decode_cloud_head
 from potserver.codec.kernels import encode_kernels
@@ -73,7 +73,9 @@ class ReceiptSender:
             query = job.query
             self._bulk.post_now(
                 lambda: self._reply(
-                    query, encode_accepted(map_id, scan, update, waited, integrate_ms, with_kernels=True)
+                    query,
+                    scan.robot_id,
+                    encode_accepted(map_id, scan, update, waited, integrate_ms, with_kernels=True),
                 ),
                 ended=self._count_receipt,
             )
@@ -120,7 +122,7 @@ class ReceiptSender:
             self._health.count(f"queries.integrate.{error.code}")
             self._refuse_query(job.query, error)
             return
-        robot_id = job.robot_id or ""
+        robot_id = job.robot_id
         payload = None if isinstance(error, TooLargeError) and job.n_bytes > self._max_bytes else job.payload
         n_bytes = 0 if payload is None else job.n_bytes
 
@@ -176,9 +178,9 @@ class ReceiptSender:
             congestion_control=zenoh.CongestionControl.BLOCK,
         )
 
-    def _reply(self, query: zenoh.Query, wire: Wire) -> None:
+    def _reply(self, query: zenoh.Query, robot_id: str, wire: Wire) -> None:
         with query:
-            reply(query, self._keys.query(INTEGRATE), wire)
+            reply(query, self._keys.integrate(robot_id), wire)
             self._health.count("queries.integrate.ok")
 
 
@@ -193,7 +195,7 @@ def refusal(error: PotserverError) -> messages.ReceiptStatus:
 def encode_accepted(
     map_id: str, scan: Scan, update: MapUpdate, waited: Waited, integrate_ms: float, *, with_kernels: bool
 ) -> Wire:
-    """The receipt of a cloud that is in the map; with its kernels for `q/integrate`."""
+    """The receipt of a cloud that is in the map; with its kernels for `in/<robot>/integrate`."""
     return encode(
         messages.Receipt(
             map=map_id,

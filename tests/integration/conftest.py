@@ -96,8 +96,10 @@ class Client:
         return answers
 
     def ask(self, op: str, payload: Any = None, **options: Any) -> list[messages.Message]:
-        """All replies to `q/<op>`; at least one."""
-        answers = self.get(self.keys.query(op), payload, **options)
+        """All replies to `q/<op>`, or to the `integrate` of the robot that a cloud names; at least one."""
+        robot = getattr(payload, "robot", None) or "r1"
+        key = self.keys.integrate(robot) if op == "integrate" else self.keys.query(op)
+        answers = self.get(key, payload, **options)
         assert answers, f"nobody answered {op}"
         return answers
 

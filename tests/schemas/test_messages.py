@@ -166,14 +166,15 @@ def test_the_readme_has_every_key(readme: str) -> None:
     expected = {
         site.cloud("<robot>"),
         site.pose("<robot>"),
+        site.integrate("<robot>"),
         site.receipt("<robot>"),
         site.params("<robot>"),
         site.revision,
         site.robot_token("<robot>"),
         site.server_token("<server>"),
         keys.stats_key(keys.DEFAULT_ROOT, "<server>"),
-        *(site.query(op) for op in ("integrate", *QUESTIONS)),
-        *(site.control(verb) for verb in keys.CONTROL_VERBS),
+        *(site.query(op) for op in QUESTIONS),
+        *(site.control(verb) for verb in (*keys.CONTROL_VERBS, keys.CHANGE_ATOMS)),
     }
     table = readme.split("## Keys")[1].split("\n## ")[0]
     assert set(re.findall(r"^\| `(@?pot/[^`]+)` \|", table, re.MULTILINE)) == expected
