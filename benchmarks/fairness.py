@@ -2,8 +2,8 @@
 
     python benchmarks/fairness.py --grids 8 --seconds 30
 
-`potserver serve` runs as a process of its own, and is fed some scans. Then every asker is a process with a session of its own: some ask
-for grids of 3.3 million cells again and again, one for 190,000 points, and one for 100 points, ten times a second.
+`potserver serve` runs as a process of its own, and is fed some scans. Then every asker is a process with a session of its own:
+some ask for grids of 3.3 million cells again and again, one for 190,000 points, and one for 100 points, ten times a second.
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ import subprocess
 import sys
 import tempfile
 import time
-from pathlib import Path
 from typing import Any
 
 import numpy as np

@@ -85,7 +85,8 @@ class Answers:
                 if step.reply is not None:
                     wire = encode(step.reply)
                     reply(query, key, wire)
-                yield step.rest_is_short
+                if step.rest_is_short is not None:
+                    yield step.rest_is_short
             query.drop()
             self._served.health.count(f"{name}.ok")
             self._served.health.observe(question.op, (time.monotonic() - arrived_s) * 1e3)

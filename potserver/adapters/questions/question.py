@@ -57,7 +57,7 @@ class Step(NamedTuple):
     """One bounded piece of the work on an answer; others may have their turn after it."""
 
     reply: messages.Message | None  # to be sent now
-    rest_is_short: bool
+    rest_is_short: bool | None  # None: that was all
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -92,12 +92,12 @@ class Question(Generic[QueryT]):
                 reply = None if self.each is None else self.each(plan, number, part)
             if self.whole is not None:
                 parts.append(part)
-            if reply is not None or number + 1 < plan.n_parts:
-                yield Step(reply, is_short)
+            is_last = number + 1 == plan.n_parts and self.whole is None
+            yield Step(reply, None if is_last else is_short)
         if self.whole is not None:
             with np.errstate(over="ignore"):
                 reply = self.whole(plan, parts)
-            yield Step(reply, is_short)
+            yield Step(reply, None)
 
 
 class Single(Plan[messages.Message]):
