@@ -15,7 +15,7 @@ from potserver.adapters.answers import Answers
 from potserver.adapters.clouds import CloudDoor, CloudReader, CloudSubscriber, IntegrateQueryable
 from potserver.adapters.intake import IntakeQueue
 from potserver.adapters.outbox import Outbox
-from potserver.adapters.poses import WAIT_S, PoseBuffer, PoseSubscriber
+from potserver.adapters.poses import PoseBuffer, PoseSubscriber
 from potserver.adapters.presence import RobotWatch, ServerToken
 from potserver.adapters.query_pool import QueryPool
 from potserver.adapters.queryable import MapQueryable
@@ -96,7 +96,6 @@ class MapNode:
             max_gap_s=settings.poses.max_gap_s,
             max_future_s=settings.intake.max_future_s,
             max_robots=limits.max_robots,
-            wait_s=WAIT_S,
         )
         writer = MapWriter(
             mapper,

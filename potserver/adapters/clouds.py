@@ -124,14 +124,14 @@ class CloudReader:
     """Makes scans of queued clouds, on the writer's thread."""
 
     def __init__(self, limits: Limits, poses: PoseBuffer) -> None:
-        self._limits, self._poses = limits, poses
+        self._limits, self.poses = limits, poses
 
     def read(self, job: CloudJob) -> Scan:
         """The scan; a cloud without a pose takes the one of the robot's pose stream.
 
         Raises:
-            PotserverError: see `codec.clouds.decode_cloud`.
+            PotserverError: see `codec.clouds.decode_cloud`; `PoseNotYetError` if it may be read later.
         """
         return codec.decode_cloud(
-            job.payload.to_bytes(), robot_id=job.robot_id, limits=self._limits, pose_at=self._poses.at
+            job.payload.to_bytes(), robot_id=job.robot_id, limits=self._limits, pose_at=self.poses.at
         )

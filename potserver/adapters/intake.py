@@ -87,6 +87,7 @@ class IntakeQueue:
         self._counts: collections.Counter[str] = collections.Counter()  # clouds of each lane
         self._sizes: collections.Counter[str] = collections.Counter()  # bytes of each lane
         self._n_bytes = 0
+        self._not_before: dict[str, float] = {}  # lanes whose first cloud waits for its pose, and how long
         self._busy = False
         self._admitting, self._closed = True, False
 
@@ -130,9 +131,7 @@ class IntakeQueue:
             for victim in victims:
                 self._forget(victim)
             self._epochs[-1].lanes.setdefault(job.lane, collections.deque()).append(job)
-            self._counts[job.lane] += 1
-            self._sizes[job.lane] += job.n_bytes
-            self._n_bytes += job.n_bytes
+            self._add_counts(job)
             self._changed.notify_all()
             return [Refusal(victim, error) for victim in victims]
 
@@ -164,20 +163,47 @@ class IntakeQueue:
         with self._changed:
             while not self._closed:
                 epoch = self._epochs[0]
-                if epoch.lanes:
-                    lane, jobs = epoch.lanes.popitem(last=False)
+                now_s = time.monotonic()
+                lane = next((n for n in epoch.lanes if self._not_before.get(n, now_s) <= now_s), None)
+                if lane is not None:
+                    self._not_before.pop(lane, None)
+                    jobs = epoch.lanes.pop(lane)
                     job = jobs.popleft()
                     if jobs:
                         epoch.lanes[lane] = jobs  # to the back: the next robot is next
                     self._drop_counts(job)
                     self._busy = True
                     return job
-                if epoch.barrier is not None:
+                if epoch.barrier is not None and not epoch.lanes:
                     self._epochs.popleft()
                     self._busy = True
                     return epoch.barrier
-                self._changed.wait()
+                soonest_s = min((self._not_before[n] for n in epoch.lanes), default=None)
+                self._changed.wait(None if soonest_s is None else soonest_s - now_s)
             return None
+
+    def put_back(self, job: CloudJob, until_s: float) -> bool:
+        """A cloud that `take` gave cannot be mapped yet; its robot waits, and the others go on.
+
+        Args:
+            job: The cloud; it stays the first of its robot.
+            until_s: When it is given again at the latest, of `time.monotonic`; sooner if `wake` is called.
+        Returns:
+            False if the queue is closed; the caller must refuse the cloud.
+        """
+        with self._changed:
+            if self._closed:
+                return False
+            self._epochs[0].lanes.setdefault(job.lane, collections.deque()).appendleft(job)
+            self._not_before[job.lane] = until_s
+            self._add_counts(job)
+            return True
+
+    def wake(self, lane: str) -> None:
+        """What the first cloud of a robot waits for is there."""
+        with self._changed:
+            if self._not_before.pop(lane, None) is not None:
+                self._changed.notify_all()
 
     def done(self) -> None:
         """The work that `take` gave is finished."""
@@ -230,6 +256,11 @@ class IntakeQueue:
                     del epoch.lanes[job.lane]
                 break
         self._drop_counts(job)
+
+    def _add_counts(self, job: CloudJob) -> None:
+        self._counts[job.lane] += 1
+        self._sizes[job.lane] += job.n_bytes
+        self._n_bytes += job.n_bytes
 
     def _drop_counts(self, job: CloudJob) -> None:
         self._counts[job.lane] -= 1

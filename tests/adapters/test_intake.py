@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import collections
 import threading
+import time
 
 import pytest
 import zenoh
@@ -247,3 +248,50 @@ def test_many_producers_and_one_consumer_lose_nothing() -> None:
     queue.close()
     consumer.join(10)
     assert len({id(each) for each in mapped + refused}) == len(mapped) + len(refused) == 1200
+
+
+# --- clouds that cannot be mapped yet -----------------------------------------------------------------------
+
+
+def test_a_robot_that_waits_holds_up_nobody_and_keeps_its_order() -> None:
+    queue = queue_of(10)
+    first, second, other = job("a"), job("a"), job("b")
+    for each in (first, second, other):
+        queue.admit(each)
+    assert take(queue) is first
+    assert queue.put_back(first, time.monotonic() + 1e6)
+    assert take(queue) is other
+    assert (queue.depth, queue.n_bytes) == (2, 20)
+    queue.wake("a")
+    assert [take(queue), take(queue)] == [first, second]
+
+
+def test_a_cloud_that_waits_is_given_again_when_its_time_is_over() -> None:
+    queue = queue_of()
+    late = job("a")
+    queue.admit(late)
+    assert take(queue) is late
+    queue.put_back(late, time.monotonic() + 0.01)
+    assert take(queue) is late
+
+
+def test_a_barrier_comes_after_the_clouds_that_wait() -> None:
+    queue = queue_of()
+    late, barrier = job("a"), Barrier(lambda: None, lambda _: None)
+    queue.admit(late)
+    assert take(queue) is late
+    queue.put_back(late, time.monotonic() + 1e6)
+    queue.admit_barrier(barrier)
+    queue.admit(job("b"))
+    queue.wake("a")
+    assert take(queue) is late
+    assert queue.take() is barrier
+
+
+def test_a_closed_queue_takes_nothing_back() -> None:
+    queue = queue_of()
+    late = job("a")
+    queue.admit(late)
+    assert take(queue) is late
+    queue.close()
+    assert not queue.put_back(late, time.monotonic() + 1e6)
