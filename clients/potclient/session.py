@@ -81,7 +81,7 @@ def open_session(options: SessionOptions) -> zenoh.Session:
 def add_zenoh_arguments(parser: argparse.ArgumentParser) -> None:
     """Zenoh's usual flags, as in its own examples. A parser with `argument_default` gets no other defaults."""
     if parser.argument_default is None:
-        parser.set_defaults(cfg=[], multicast_scouting=None, no_shm=False, wait=0.0)
+        parser.set_defaults(cfg=[], multicast_scouting=None, shm=None, wait=0.0)
     group = parser.add_argument_group("Zenoh session")
     group.add_argument(
         "-e",
@@ -115,9 +115,9 @@ def add_zenoh_arguments(parser: argparse.ArgumentParser) -> None:
         help="look for servers by multicast (default: off)",
     )
     group.add_argument(
-        "--no-shm",
-        action="store_true",
-        help="no shared memory between processes of this host (small /dev/shm, containers)",
+        "--shm",
+        action=argparse.BooleanOptionalAction,
+        help="clouds through shared memory, if the server has it on too: 4 to 8 times as fast, without a bound (default: off)",
     )
     group.add_argument(
         "--wait",
@@ -140,7 +140,7 @@ def options_from_arguments(arguments: argparse.Namespace) -> SessionOptions:
         config_file=arguments.config,
         overrides=parse_overrides(arguments.cfg),
         multicast_scouting=arguments.multicast_scouting,
-        shared_memory=False if arguments.no_shm else None,
+        shared_memory=arguments.shm,
         connect_timeout_s=arguments.wait,
     )
 

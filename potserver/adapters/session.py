@@ -40,8 +40,9 @@ class ZenohSettings:
         default_factory=dict
     )
     shared_memory: Annotated[
-        bool, "puts between processes of one host may go through /dev/shm; off in small containers"
-    ] = True
+        bool | None,
+        "puts between processes of one host go through /dev/shm: fast, but every session leaves 18 MB; unset: off",
+    ] = None
 
 
 def build_config(settings: ZenohSettings, *, root: str, wire_guard_bytes: int) -> zenoh.Config:
@@ -61,7 +62,7 @@ def build_config(settings: ZenohSettings, *, root: str, wire_guard_bytes: int) -
         "mode": settings.mode,
         "connect/endpoints": settings.connect,
         "listen/endpoints": settings.listen,
-        "transport/shared_memory/enabled": None if settings.shared_memory else False,
+        zenoh_config.SHM_ENABLED: settings.shared_memory,
     }
     try:
         config = zenoh_config.build(
