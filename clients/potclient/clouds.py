@@ -140,6 +140,7 @@ class Clouds:
             lambda cloud: link.put(publisher, cloud),
             numbering=self._numbering(robot),
             is_matched=lambda: is_matching(publisher),
+            explain=lambda: link.why_no_receipt(robot, is_matched=is_matching(publisher)),
             credit=self._options.credit,
             receipt_timeout_s=self._options.receipt_timeout_s,
         )

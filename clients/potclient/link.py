@@ -105,7 +105,7 @@ class Link:
         timeout_s: How long an answer may take, unless a question says otherwise.
     Raises:
         UsageError: an option is not legal.
-        NoServerError: nobody listens at the endpoint.
+        NoServerError: nobody listens at the endpoint. AccessError: somebody does, and does not let us in.
     """
 
     def __init__(self, keys: MapKeys, options: SessionOptions, timeout_s: float) -> None:
@@ -331,6 +331,26 @@ class Link:
         return LostReplyError(
             f"{key}: a server is up but the question of {n_bytes} bytes got no answer: denied by access control, above its size"
             " filter, or the server failed while answering"
+        )
+
+    def why_no_receipt(self, robot: str, *, is_matched: bool) -> str:
+        """The likely cause of a robot's clouds coming to nothing, in words; Zenoh tells a sender of none.
+
+        Args:
+            robot: Whose clouds.
+            is_matched: Whether somebody takes them.
+        """
+        if self.is_closed:
+            return "the client was closed"
+        if not self._session.info.transports():
+            return f"the connection to {self.where} is lost"
+        if not self.servers:
+            return f"no server at {self.where} serves map {self.keys.map_id!r}{self._other_maps_hint()}"
+        if not is_matched:
+            return f"a server is up and takes no clouds from this client: its access control lets others be {robot!r}"
+        return (
+            f"a server is up and gave no receipt: its access control may not let this client send as {robot!r} or hear its"
+            " receipts, the cloud may be above its size filter, or it is far behind"
         )
 
     def _querier(self, key: str, *, is_bulk: bool = False) -> zenoh.Querier:

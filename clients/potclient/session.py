@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import json
 from collections.abc import Sequence
 from pathlib import Path
 
 import zenoh
 
-from potclient import zenoh_config
-from potclient.errors import NoServerError, UsageError
+from potclient import diagnosis, zenoh_config
+from potclient.errors import AccessError, NoServerError, UsageError
 from potclient.zenoh_config import DEFAULT_ENDPOINT
 
 
@@ -62,18 +61,26 @@ def open_session(options: SessionOptions) -> zenoh.Session:
     Raises:
         UsageError: the configuration is not one that Zenoh takes.
         NoServerError: nobody listens at the endpoints (within `connect_timeout_s`).
+        AccessError: somebody does, and does not let us in.
     """
     config = build_config(options)
+    if (problem := diagnosis.missing_file(config)) is not None:
+        raise UsageError(problem)
     try:
         return zenoh.open(config)
     except zenoh.ZError as error:
-        endpoints = json.loads(config.get_json("connect/endpoints") or "[]")
-        where = ", ".join(str(e) for e in endpoints) or "any endpoint"
+        endpoints = list(diagnosis.endpoints_of(config))
+        where = ", ".join(endpoints) or "any endpoint"
         text = zenoh_config.reason_of(error)
         if "nable to connect" in text:
+            causes = [diagnosis.cause_of(config, endpoint) for endpoint in endpoints]
+            said = "; ".join(cause.text for cause in causes)
+            if any(cause.is_refused for cause in causes):
+                raise AccessError(said) from error
             waited = f" within {options.connect_timeout_s:g} s" if options.connect_timeout_s > 0 else ""
             raise NoServerError(
-                f"nobody listens at {where}{waited}; start one with `potserver serve`, or name the right endpoint with -e"
+                f"nobody listens at {where}{waited} ({said}); start one with `potserver serve`, or name the right endpoint"
+                " with -e"
             ) from error
         raise UsageError(f"Zenoh cannot open a session to {where}: {text}") from error
 
@@ -145,16 +152,24 @@ def options_from_arguments(arguments: argparse.Namespace) -> SessionOptions:
     )
 
 
+_SECRETS = ("password", "private_key_base64")
+
+
 def parse_overrides(values: Sequence[str]) -> tuple[tuple[str, str], ...]:
     """Split `KEY:VALUE` at the first colon.
 
     Raises:
-        UsageError: there is no colon, or no key before it.
+        UsageError: there is no colon, or no key before it; or the value is a secret.
     """
     pairs = []
     for value in values:
         key, colon, json5 = value.partition(":")
         if not colon or not key.strip():
             raise UsageError(f"--cfg {value!r}: need KEY:VALUE, e.g. transport/link/tx/lease:5000")
+        if any(word in value for word in _SECRETS):
+            raise UsageError(
+                f"--cfg {key.strip()}: every user of this machine can read a command line; put secrets in a file of your"
+                " own, and name it with -c or ZENOH_CONFIG"
+            )
         pairs.append((key.strip(), json5.strip()))
     return tuple(pairs)

@@ -16,7 +16,7 @@ from typing import Annotated, Any
 
 import zenoh
 
-from potclient import zenoh_config
+from potclient import diagnosis, zenoh_config
 from potclient.errors import UsageError
 from potclient.zenoh_config import DEFAULT_ENDPOINT
 from potserver.errors import SettingsError
@@ -109,6 +109,8 @@ def open_session(config: zenoh.Config) -> tuple[zenoh.Session, list[str]]:
     Raises:
         SettingsError: an endpoint cannot be opened; the message is one line with a hint.
     """
+    if (problem := diagnosis.missing_file(config)) is not None:
+        raise SettingsError(problem)
     wanted = _endpoints(config)
     tries = _FREE_PORT_TRIES if any(_wants_free_port(endpoint) for endpoint in wanted) else 1
     for attempt in range(1, tries + 1):

@@ -324,19 +324,6 @@ def test_a_saved_map_comes_back_with_another_epoch_and_a_higher_revision(
     assert_same_map(ours.state, again.state)
 
 
-def test_copies_belong_to_their_map(tmp_path: Path, open_map: OpenMap) -> None:
-    ours = open_map(tmp_path)
-    ours.store.save("two", ours.mapper, ours.stamps)
-    copy = tmp_path / "saved" / "default" / "two.map"
-    (tmp_path / "saved" / "other").mkdir()
-    copy.rename(tmp_path / "saved" / "other" / "two.map")
-    with pytest.raises(UnknownMapError, match=r"there are: none$"):
-        ours.store.load("two", ours.mapper)
-    (tmp_path / "saved" / "other" / "two.map").rename(tmp_path / "saved" / "two.map")
-    with pytest.raises(UnknownMapError, match="move it to"):  # where copies lay before each map had a folder
-        ours.store.load("two", ours.mapper)
-
-
 def test_saved_maps_are_bounded_in_number(tmp_path: Path, open_map: OpenMap) -> None:
     ours = open_map(tmp_path, max_saved=1)
     ours.store.save("a", ours.mapper, {})
