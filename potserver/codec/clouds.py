@@ -43,7 +43,7 @@ class _CloudHead(messages.Message, frozen=True, kw_only=True):
 def decode_cloud_head(payload: bytes) -> CloudHead:
     """The number and sender of a cloud; `UNKNOWN_SEQ` when even they cannot be read."""
     try:
-        head = wire.decode(payload, _CloudHead)
+        head = wire.decode(payload, _CloudHead, wire.request_limits(len(payload)))
     except wire.WireError:
         return CloudHead(UNKNOWN_SEQ, None)
     return CloudHead(head.seq, head.robot)

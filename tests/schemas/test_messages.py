@@ -195,6 +195,7 @@ def test_the_readme_has_the_limits_as_they_are(readme: str) -> None:
     values = [int(value) for value in re.findall(r"^\| [^|]+ \| (\d+)", table, re.MULTILINE)]
     assert values == [
         *wire.DEFAULT_LIMITS,
+        wire.MAX_REQUEST_VALUES,
         wire.MAX_STRING_BYTES,
         messages.MAX_AXES,
         messages.MAX_AXIS_LENGTH,
