@@ -2,9 +2,9 @@
 
     python benchmarks/sessions.py --sessions 500 --at-once 4
 
-`potserver serve` runs as a process of its own. Robots come one after the other, each a process with a session of
-its own, which sends ten clouds of 60 kilobytes, follows its receipts, asks, closes its client and leaves. The
-server's memory is read from its statistics; every exit code but 0 is told.
+`potserver serve` runs as a process of its own. Robots come one after the other, each a process with a session of its own,
+which sends ten clouds of 60 kilobytes, follows its receipts, asks, and closes its client and leaves while one of its threads is
+asking still. The server's memory is read from its statistics; every exit code but 0 is told.
 """
 
 from __future__ import annotations
@@ -12,15 +12,17 @@ from __future__ import annotations
 import argparse
 import collections
 import concurrent.futures
+import contextlib
 import subprocess
 import sys
+import threading
 from typing import Any
 
 import numpy as np
 
 from benchmarks.server_process import ServerProcess
 from benchmarks.shared import keep, parser_of
-from potclient import MapClient
+from potclient import MapClient, PotclientError
 
 _SCENE_POINTS = 5_000  # on a sphere: the map is done after the first few
 
@@ -87,7 +89,18 @@ def _live(options: argparse.Namespace) -> None:
         for _ in range(10):  # shared memory comes into use with the third or so
             client.publish(points, np.eye(4), robot=options.robot, wait=True)
         client.flush(60.0)
+        client.watch_revisions(lambda _: None)
+        asking = threading.Thread(target=_ask, args=(client, points), daemon=True)
+        asking.start()
+        client.publish(points, np.eye(4), robot=options.robot)  # has no receipt when the client closes
         client.occupancy(points[:100])
+
+
+def _ask(client: MapClient, points: np.ndarray) -> None:
+    """Is in the middle of a question when the client closes."""
+    with contextlib.suppress(PotclientError):
+        while True:
+            client.occupancy(np.tile(points, (10, 1)))
 
 
 if __name__ == "__main__":

@@ -77,8 +77,7 @@ class Subscription:
 
     def close(self) -> None:
         """Stop; the callback may still be running once more when this returns."""
-        with contextlib.suppress(zenoh.ZError):
-            self._subscriber.undeclare()
+        undeclare(self._subscriber)
         self._on_close(self)
 
     def runs_on(self, thread: threading.Thread) -> bool:
@@ -119,6 +118,8 @@ class Link:
             tuple[str, bool], zenoh.Querier
         ] = {}  # by key, and whether it is for large questions
         self._numbers = itertools.count()  # of questions
+        self._calls_changed = threading.Condition()
+        self.n_calls = 0  # threads that are inside Zenoh for us
         self._declared: list[Any] = []
         self._subscriptions: list[Subscription] = []
         self._readers: weakref.WeakSet[Subscription] = weakref.WeakSet()  # all whose threads may still run
@@ -147,12 +148,13 @@ class Link:
         for subscription in subscriptions:
             subscription.close()
         for entity in declared:
-            with contextlib.suppress(zenoh.ZError):
-                entity.undeclare()
+            undeclare(entity)
         with contextlib.suppress(zenoh.ZError):
             self._session.close()
         # A thread that comes back from Zenoh while the interpreter shuts down aborts the process.
         until = time.monotonic() + _JOIN_S
+        with self._calls_changed:
+            self._calls_changed.wait_for(lambda: not self.n_calls, _JOIN_S)
         for reader in list(self._readers):
             if not reader.runs_on(caller):
                 reader.join(max(0.0, until - time.monotonic()))
@@ -265,7 +267,7 @@ class Link:
             qos = _query_qos(key, is_bulk=is_bulk)
             replies = self._call(self._session.get, key, timeout=timeout_s, **sent, **qos)
         for_silence = functools.partial(self._silence, key, len(payload), was_ready)
-        return self._checked(replies, key, timeout_s, for_silence)
+        return self._checked(iter(replies), key, timeout_s, for_silence)
 
     def deadline_ms(self, timeout_s: float | None) -> float:
         """The deadline that a message carries, so that the server starts no work that nobody waits for."""
@@ -275,7 +277,7 @@ class Link:
         self, replies: Any, key: str, timeout_s: float, for_silence: Callable[[], PotclientError]
     ) -> Iterator[zenoh.Sample]:
         n = 0
-        for reply in replies:
+        while (reply := self._next(replies)) is not None:
             if reply.ok is not None:
                 n += 1
                 yield reply.ok
@@ -291,6 +293,11 @@ class Link:
             raise error
         if n == 0:
             raise for_silence()
+
+    def _next(self, replies: Any) -> Any:
+        """The next reply; None at the end."""
+        with self._inside():
+            return next(replies, None)
 
     def _silence(self, key: str, n_bytes: int, was_ready: bool) -> PotclientError:
         """Why a question got no answer at all. Zenoh reports all of these alike: as an empty list of replies.
@@ -365,12 +372,25 @@ class Link:
             return querier
 
     def _call(self, function: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
-        self.check_open()
         try:
-            return function(*args, **kwargs)
+            with self._inside():
+                self.check_open()
+                return function(*args, **kwargs)
         except zenoh.ZError as error:
             self.check_open()
             raise LostReplyError(f"Zenoh: {error}") from error
+
+    @contextlib.contextmanager
+    def _inside(self) -> Iterator[None]:
+        """Be counted: `close` waits for whoever is inside Zenoh."""
+        with self._calls_changed:
+            self.n_calls += 1
+        try:
+            yield
+        finally:
+            with self._calls_changed:
+                self.n_calls -= 1
+                self._calls_changed.notify_all()
 
     # --- streams -------------------------------------------------------------------------------------------------------------
 
@@ -436,6 +456,12 @@ class Link:
     def _forget(self, subscription: Subscription) -> None:
         with self._lock, contextlib.suppress(ValueError):  # closed twice
             self._subscriptions.remove(subscription)
+
+
+def undeclare(entity: Any) -> None:
+    """End a declaration; one that another thread uses right now ("Already borrowed") goes with the session."""
+    with contextlib.suppress(zenoh.ZError, RuntimeError):
+        entity.undeclare()
 
 
 def is_matching(entity: zenoh.Publisher | zenoh.Querier) -> bool:

@@ -102,17 +102,30 @@ class ServerToken:
         self._token.undeclare()
 
 
-class AskerWatch:
-    """Gives up the questions of sessions whose connection to us ended.
+class SessionWatch:
+    """Counts the sessions that are connected to us, and gives up the questions of those whose connection ended.
 
     Of sessions behind a router we do not hear: deadlines end their questions. A token of the asker would travel through
     routers, but anybody could undeclare another's.
+
+    Args:
+        session: Ours.
+        give_up: Ends the questions of a session, by its Zenoh id; how many there were.
+        max_sessions: How many may be there. Zenoh lets no more in, and tells nobody: so the log says when it is full.
     """
 
-    def __init__(self, session: zenoh.Session, give_up: Callable[[str], int]) -> None:
-        self._give_up = give_up
-        self._events = session.info.declare_transport_events_listener(zenoh.handlers.FifoChannel(64))
-        self._thread = spawn("asker-watch", self._run)
+    def __init__(self, session: zenoh.Session, give_up: Callable[[str], int], max_sessions: int) -> None:
+        self._give_up, self._max_sessions = give_up, max_sessions
+        self._open: set[str] = set()
+        self._events = session.info.declare_transport_events_listener(
+            zenoh.handlers.FifoChannel(64), history=True
+        )
+        self._thread = spawn("session-watch", self._run)
+
+    @property
+    def n_open(self) -> int:
+        """Sessions that are connected now."""
+        return len(self._open)
 
     def close(self) -> None:
         """Follow no more."""
@@ -121,10 +134,16 @@ class AskerWatch:
 
     def _run(self) -> None:
         for event in self._events:
+            zid = str(event.transport.zid)
             if event.kind == zenoh.SampleKind.DELETE:
-                n = self._give_up(str(event.transport.zid))
+                self._open.discard(zid)
+                n = self._give_up(zid)
                 if n:
-                    log.info("asker_gone", zid=str(event.transport.zid), n_questions=n)
+                    log.info("asker_gone", zid=zid, n_questions=n)
+            else:
+                self._open.add(zid)
+                if len(self._open) == self._max_sessions:
+                    log.warning("sessions_full", n_sessions=self._max_sessions)
 
 
 class RobotWatch:
