@@ -66,7 +66,7 @@ class PoseSettings:
 class AtomSettings:
     """Changes of the atom dictionary over `ctl/atoms`."""
 
-    writable: Annotated[bool, "whoever reaches the server may add and remove atoms"] = True
+    writable: Annotated[bool, "whoever may ask `ctl/atoms` may add and remove atoms"] = False
     save: Annotated[bool, "write each change to the file `dictionary`; else a restart forgets it"] = False
 
 

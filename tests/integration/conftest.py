@@ -428,6 +428,7 @@ def map_server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[MapServer]:
             "limits.max_query_points": 5000,
             "store.directory": str(tmp_path_factory.mktemp("store")),
             "store.fsync": False,
+            "atoms.writable": True,
         }
     )
     with MapServer(settings, listen="tcp/127.0.0.1:0") as server:
