@@ -2,10 +2,10 @@
 
     python benchmarks/kill.py --kills 100
 
-Two robots publish and one asks (`q/integrate`) while `potserver serve` runs as a process of its own on one store. It gets
-SIGKILL after a random time, at times while it starts, and is started again. What the journal and the log say then is the order
-in which scans entered the map: every acknowledged scan must be among them, each once. At the end the map on the disk is
-compared, tile by tile, with one that was fed the same scans in that order and never killed.
+Two robots publish and one asks (`in/<robot>/integrate`) while `potserver serve` runs as a process of its own on one store.
+It gets SIGKILL after a random time, at times while it starts, and is started again. What the journal and the log say then is
+the order in which scans entered the map: every acknowledged scan must be among them, each once. At the end the map on the disk
+is compared, tile by tile, with one that was fed the same scans in that order and never killed.
 """
 
 from __future__ import annotations

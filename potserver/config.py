@@ -52,6 +52,7 @@ class QuerySettings:
 
     threads: Annotated[int, "questions in work at once"] = 2
     max_queued: Annotated[int, "questions that may wait, all maps; one more is refused at once"] = 64
+    deadline_s: Annotated[float, "for questions that name no deadline: nobody is taken to wait longer"] = 10.0
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -63,9 +64,9 @@ class PoseSettings:
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class AtomSettings:
-    """Changes of the atom dictionary over `q/atoms`."""
+    """Changes of the atom dictionary over `ctl/atoms`."""
 
-    writable: Annotated[bool, "whoever reaches the server may add and remove atoms"] = True
+    writable: Annotated[bool, "whoever may ask `ctl/atoms` may add and remove atoms"] = False
     save: Annotated[bool, "write each change to the file `dictionary`; else a restart forgets it"] = False
 
 

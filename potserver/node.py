@@ -10,10 +10,12 @@ from typing import NamedTuple, Protocol
 import zenoh
 
 from potschemas import keys
-from potserver.adapters.clouds import CloudDoor, CloudReader, CloudSubscriber
+from potserver.adapters.answers import Answers
+from potserver.adapters.audit import Audit
+from potserver.adapters.clouds import CloudDoor, CloudReader, CloudSubscriber, IntegrateQueryable
 from potserver.adapters.intake import IntakeQueue
 from potserver.adapters.outbox import Outbox
-from potserver.adapters.poses import WAIT_S, PoseBuffer, PoseSubscriber
+from potserver.adapters.poses import PoseBuffer, PoseSubscriber
 from potserver.adapters.presence import RobotWatch, ServerToken
 from potserver.adapters.query_pool import QueryPool
 from potserver.adapters.queryable import MapQueryable
@@ -92,7 +94,6 @@ class MapNode:
             max_gap_s=settings.poses.max_gap_s,
             max_future_s=settings.intake.max_future_s,
             max_robots=limits.max_robots,
-            wait_s=WAIT_S,
         )
         writer = MapWriter(
             mapper,
@@ -100,7 +101,7 @@ class MapNode:
             order=CloudOrder(heard, allow_repeats=settings.intake.allow_repeats),
             bounds=Bounds(settings.intake.max_future_s, limits.max_coordinate_m, limits.max_map_bytes),
             intake=self.intake,
-            reader=CloudReader(limits, poses, frozenset(settings.intake.robots)),
+            reader=CloudReader(limits, poses),
             receipts=self._receipts,
             health=health,
         )
@@ -125,24 +126,21 @@ class MapNode:
             mapper=self.mapper,
             atoms=shared.atoms,
             health=health,
+            audit=Audit(self.map_id),
             limits=limits,
             durable=durable,
         )
+        answers = Answers(served, shared.pool, deadline_s=settings.queries.deadline_s)
         return [
             PoseSubscriber(session, map_keys, poses=poses, health=health, allowed_robots=allowed),
             CloudSubscriber(session, map_keys, door),
-            MapQueryable(
-                session,
-                map_keys,
-                questions=QUESTIONS,
-                integrate=door.admit_query,
-                served=served,
-                pool=shared.pool,
-            ),
+            IntegrateQueryable(session, map_keys, door, health),
+            MapQueryable(session, map_keys, questions=QUESTIONS, answers=answers, health=health),
             ControlQueryable(
                 session,
                 map_keys,
                 served=served,
+                answers=answers,
                 intake=self.intake,
                 writer=writer,
                 withdraw=self.withdraw,

@@ -20,10 +20,16 @@ from types import TracebackType
 import zenoh
 
 from potschemas import __version__, keys, messages
-from potserver.adapters.presence import OtherServers
+from potserver.adapters.presence import OtherServers, SessionWatch
 from potserver.adapters.query_pool import QueryPool
 from potserver.adapters.questions.registry import warm_up
-from potserver.adapters.session import build_config, close_session, open_session
+from potserver.adapters.session import (
+    build_config,
+    close_session,
+    max_sessions_of,
+    open_session,
+    raise_file_limit,
+)
 from potserver.adapters.stats import StatsPublisher, stats_now
 from potserver.atoms.store import AtomStore
 from potserver.config import Settings, as_tree
@@ -75,6 +81,8 @@ class MapServer:
         self.nodes: dict[str, MapNode] = {}  # by map id; to look at
         self.pool: QueryPool | None = None
         self._stats: StatsPublisher | None = None
+        self._sessions: SessionWatch | None = None
+        self._max_sessions = 0
         self._stores: dict[str, MapStore | ReadOnlyStore] = {}
         self.web: WebListener | None = None
         self._stopping = threading.Event()
@@ -171,6 +179,7 @@ class MapServer:
                 "queries.bytes": pool.n_bytes if pool else 0,
                 "outbox.prompt": sum(node.prompt.depth for node in nodes),
                 "outbox.bulk": sum(node.bulk.depth for node in nodes),
+                "sessions": self._sessions.n_open if self._sessions else 0,
             },
             maps={node.map_id: node.mapper.state for node in nodes},
         )
@@ -184,6 +193,7 @@ class MapServer:
     def _start(self, s: Settings) -> None:
         mappers = [self._make_map(map_id) for map_id in s.maps]
         config = build_config(s.zenoh, root=s.root, wire_guard_bytes=s.limits.wire_guard_bytes)
+        self._max_sessions = raise_file_limit(max_sessions_of(config))
         try:
             heard = [self._open_store(mapper) for mapper in mappers]
             self._session, self._endpoints = open_session(config)
@@ -217,6 +227,7 @@ class MapServer:
             max_queued=s.queries.max_queued,
             max_queued_bytes=QUEUE_MESSAGES * s.limits.max_query_bytes,
         )
+        self._sessions = SessionWatch(session, self.pool.give_up, self._max_sessions)
         shared = Shared(s, session, self.pool, _atom_store(mappers, s), self.health)
         for mapper, numbers in zip(mappers, heard, strict=True):
             keeper = self._stores.get(mapper.map_id, MemoryOnly())
@@ -272,8 +283,9 @@ class MapServer:
         # subscribers live on through the drain, so that whoever still sends is told
         drained = [node.drain(deadline) for node in nodes]
         answered = self.pool is None or self.pool.close(FLUSH_S)
-        if self._stats is not None:
-            self._stats.close()
+        for part in (self._stats, self._sessions):
+            if part is not None:
+                part.close()
         ended = [node.close() for node in nodes]
         kept = self._close_stores()  # after the writers: a last snapshot of what they made
         clean = all([*drained, answered, *ended, kept, close_session(session, _CLOSE_S), self._close_web()])

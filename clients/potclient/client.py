@@ -60,7 +60,7 @@ class MapClient:
         options: Zenoh session options; `connect` is added when they name no endpoint.
     Raises:
         UsageError: an id, the root or an option is not legal.
-        NoServerError: nobody listens at the endpoint.
+        NoServerError: nobody listens at the endpoint. AccessError: somebody does, and does not let us in.
     """
 
     def __init__(

@@ -50,11 +50,13 @@ class Clouds:
         self, cloud: messages.Cloud, *, seq: int | None, stamp_ns: int | None, timeout_s: float | None
     ) -> Receipt:
         """See `MapClient.integrate`."""
-        assert cloud.robot is not None
-        number, stamp_ns = self._numbering(cloud.robot).assign(seq, stamp_ns)
+        robot = cloud.robot
+        assert robot is not None
+        number, stamp_ns = self._numbering(robot).assign(seq, stamp_ns)
         cloud = msgspec.structs.replace(cloud, seq=number, stamp_ns=stamp_ns, session=self.session)
         started = time.monotonic()
-        reply = self._link.ask("integrate", cloud, messages.Receipt, timeout_s)
+        key = self._link.keys.integrate(robot)
+        reply = self._link.ask(key, cloud, messages.Receipt, timeout_s)
         receipt = Receipt(reply, round_trip_s=time.monotonic() - started)
         if (error := receipt.error()) is not None:
             raise error
@@ -141,6 +143,7 @@ class Clouds:
             lambda cloud: link.put(publisher, cloud),
             numbering=self._numbering(robot),
             is_matched=lambda: is_matching(publisher),
+            explain=lambda: link.why_no_receipt(robot, is_matched=is_matching(publisher)),
             credit=self._options.credit,
             receipt_timeout_s=self._options.receipt_timeout_s,
         )

@@ -22,6 +22,10 @@ class NoServerError(PotclientError):
     retryable = True
 
 
+class AccessError(PotclientError):
+    """Somebody is there and does not let this client in: its certificate, its password, or the kind of connection is wrong."""
+
+
 class QueryTimeoutError(PotclientError, TimeoutError):
     """A server took the question and did not answer in time, or a wait ended before its condition held."""
 

@@ -9,6 +9,7 @@ a cloud that the server had to drop the feed pauses, longer each time, up to a s
 from __future__ import annotations
 
 import dataclasses
+import logging
 import secrets
 import threading
 import time
@@ -21,6 +22,8 @@ from potclient.errors import ClosedError, QueryTimeoutError, UsageError
 from potclient.results import FeedCounts, Receipt, TransportedParams
 from potschemas import messages
 from potschemas.messages import ReceiptStatus
+
+log = logging.getLogger("potclient")
 
 _MATCH_POLL_S = 0.02  # only while a cloud waits and no server listens
 _BACKOFF_S = (0.05, 1.0)  # after a cloud that the server dropped: first, longest
@@ -87,6 +90,7 @@ class Feed:
         is_matched: Whether somebody takes this robot's clouds now; while nobody does, the newest cloud waits in the slot.
         credit: How many clouds may be without a receipt.
         receipt_timeout_s: After this long without a receipt a cloud counts as unknown and its credit returns.
+        explain: The likely cause of clouds coming to nothing, for people.
         clock: Monotonic seconds.
     """
 
@@ -99,10 +103,11 @@ class Feed:
         is_matched: Callable[[], bool],
         credit: int,
         receipt_timeout_s: float,
+        explain: Callable[[], str] = lambda: "no server takes clouds of this robot",
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.robot = robot
-        self._put, self._is_matched, self._clock = put, is_matched, clock
+        self._put, self._is_matched, self._explain, self._clock = put, is_matched, explain, clock
         self._numbering = numbering
         self._credit, self._receipt_timeout_s = credit, receipt_timeout_s
         self._changed = threading.Condition()
@@ -305,6 +310,8 @@ class Feed:
             self._expired[seq] = self._in_flight.pop(seq)
             self._unknown += 1
             self._changed.notify_all()
+            if self._unknown == 1 and not any(self._outcomes.values()):  # once, and only if none ever came
+                log.warning("no receipt for cloud %d of %s: %s", seq, self.robot, self._explain())
         while len(self._expired) > _MAX_EXPIRED:
             self._expired.popitem(last=False)
 
@@ -317,9 +324,4 @@ class Feed:
     def _wait_for(self, condition: Callable[[], bool], until: float | None, what: str) -> None:
         remaining = None if until is None else until - time.monotonic()
         if not self._changed.wait_for(lambda: condition() or self._closing, remaining):
-            why = (
-                ""
-                if self._is_matched()
-                else ": no server takes clouds of this robot (none there, or not allowed)"
-            )
-            raise QueryTimeoutError(f"{what} of {self.robot}{why}")
+            raise QueryTimeoutError(f"{what} of {self.robot}: {self._explain()}")

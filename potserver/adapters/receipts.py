@@ -17,7 +17,7 @@ from potschemas.keys import MapKeys
 from potserver.adapters.audit import Audit
 from potserver.adapters.intake import CloudJob, IntakeQueue
 from potserver.adapters.outbox import End, Outbox
-from potserver.adapters.replies import INTEGRATE, asker_of, reply, reply_error
+from potserver.adapters.replies import reply, reply_error
 from potserver.codec.base import Wire, encode
 from potserver.codec.clouds import UNKNOWN_SEQ, decode_cloud_head
 from potserver.codec.kernels import encode_kernels
@@ -69,7 +69,9 @@ class ReceiptSender:
             query = job.query
             self._bulk.post_now(
                 lambda: self._reply(
-                    query, encode_accepted(map_id, scan, update, waited, integrate_ms, with_kernels=True)
+                    query,
+                    scan.robot_id,
+                    encode_accepted(map_id, scan, update, waited, integrate_ms, with_kernels=True),
                 ),
                 ended=self._count_receipt,
             )
@@ -114,15 +116,15 @@ class ReceiptSender:
         waited, state = Waited(self._intake.depth, job.wait_ms()), self._mapper.state
         if job.query is not None:
             self._health.count(f"queries.integrate.{error.code}")
-            self._refuse_query(job.query, error)
+            self._refuse_query(job.query, job.robot_id, error)
             return
-        robot_id = job.robot_id or ""
+        robot_id = job.robot_id
         payload = None if isinstance(error, TooLargeError) and job.n_bytes > self._max_bytes else job.payload
         n_bytes = 0 if payload is None else job.n_bytes
 
         def send() -> None:
             seq = UNKNOWN_SEQ if payload is None else decode_cloud_head(payload.to_bytes()).seq
-            self._audit.refused("cloud", robot_id, error, seq=seq)
+            self._audit.refused("clouds", robot_id, error, seq=seq)
             wire = encode_refused(self._keys.map_id, robot_id, seq, error, waited, state)
             self._put(self._keys.receipt(robot_id), wire, zenoh.Priority.DATA_HIGH)
 
@@ -136,9 +138,9 @@ class ReceiptSender:
         self._put(self._keys.params(scan.robot_id), wire, zenoh.Priority.DATA)
         self._health.count("params.sent")
 
-    def _refuse_query(self, query: zenoh.Query, error: PotserverError) -> None:
+    def _refuse_query(self, query: zenoh.Query, robot_id: str, error: PotserverError) -> None:
         """Knows nothing of the cloud, whose bytes can go at once."""
-        self._audit.refused("integrate", asker_of(query), error)
+        self._audit.refused("queries.integrate", robot_id, error)
 
         def send() -> None:
             with query:
@@ -158,9 +160,9 @@ class ReceiptSender:
             congestion_control=zenoh.CongestionControl.BLOCK,
         )
 
-    def _reply(self, query: zenoh.Query, wire: Wire) -> None:
+    def _reply(self, query: zenoh.Query, robot_id: str, wire: Wire) -> None:
         with query:
-            reply(query, self._keys.query(INTEGRATE), wire)
+            reply(query, self._keys.integrate(robot_id), wire)
             self._health.count("queries.integrate.ok")
 
 
@@ -175,7 +177,7 @@ def refusal(error: PotserverError) -> messages.ReceiptStatus:
 def encode_accepted(
     map_id: str, scan: Scan, update: MapUpdate, waited: Waited, integrate_ms: float, *, with_kernels: bool
 ) -> Wire:
-    """The receipt of a cloud that is in the map; with its kernels for `q/integrate`."""
+    """The receipt of a cloud that is in the map; with its kernels for `in/<robot>/integrate`."""
     return encode(
         messages.Receipt(
             map=map_id,

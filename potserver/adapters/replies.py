@@ -10,7 +10,6 @@ from potschemas import messages
 from potserver.codec.base import Wire, check_encoding, check_size, encode_error
 from potserver.errors import PotserverError
 
-INTEGRATE = "integrate"  # the one `q/<op>` that is no question: the map's writer answers it
 BUG = "a bug of the server; the traceback is in its log"
 
 

@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 from potserver.adapters.clouds import CloudReader
 from potserver.adapters.intake import CloudJob, IntakeQueue
+from potserver.adapters.poses import WAIT_S, PoseNotYetError
 from potserver.adapters.receipts import ReceiptSender
 from potserver.adapters.replies import BUG
 from potserver.adapters.stamps import check_not_future
@@ -158,6 +159,16 @@ class MapWriter:
         snapshot = self._mapper.snapshot
         self._receipts.tick(snapshot.map_revision, len(snapshot), changed)
 
+    def _waits(self, job: CloudJob, error: PoseNotYetError) -> bool:
+        """Let a cloud wait for its pose, while others are mapped; False if it has waited long enough."""
+        until_s = job.arrived_s + WAIT_S
+        if time.monotonic() >= until_s or not self._intake.put_back(job, until_s):
+            return False
+        self._reader.poses.tell_when_reached(
+            job.robot_id, error.stamp_ns, lambda: self._intake.wake(job.robot_id)
+        )
+        return True
+
     def _integrate(self, job: CloudJob) -> None:
         wait_ms = job.wait_ms()
         try:
@@ -169,7 +180,8 @@ class MapWriter:
             started_s = time.perf_counter()
             update = self._mapper.integrate(scan, commit=lambda: self._keeper.append(scan))
         except PotserverError as error:
-            self._receipts.refuse(job, error)
+            if not (isinstance(error, PoseNotYetError) and self._waits(job, error)):
+                self._receipts.refuse(job, error)
             return
         except Exception:
             log.exception("scan_failed", map_id=self._map_id, robot_id=job.robot_id)

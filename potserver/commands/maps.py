@@ -54,7 +54,7 @@ examples:
   potserver map export site.map -f pgm --resolution 0.05 --band 0.1 1.5 -o map.pgm"""
 
 _IMPORT = """\
-Make a *.map file. In the folder `saved` of a server's store, `potclient map load NAME` finds it.
+Make a *.map file. In the folder `saved/<map>` of a server's store, `potclient map load NAME` finds it.
 
   *.bt        a binary OctoMap: its voxels become evidence of a robot named after the file, and kernels are solved
               on it
@@ -64,7 +64,7 @@ Make a *.map file. In the folder `saved` of a server's store, `potclient map loa
 
 _IMPORT_EXAMPLES = """\
 examples:
-  potserver map import hall.bt -o ~/.local/state/potserver/potserver/saved/hall.map
+  potserver map import hall.bt -o ~/.local/state/potserver/potserver/saved/default/hall.map
   potclient map load hall"""
 
 _MERGE = """\
@@ -167,7 +167,7 @@ def _map_files(path: Path) -> list[Path]:
     if not path.is_dir():
         return [path]
     found = [path / TILES] if (path / TILES).exists() else sorted(path.glob(f"*/{TILES}"))
-    found += sorted(path.glob("*.map")) + sorted(path.glob(f"{SAVED}/*.map"))
+    found += sorted(path.glob("*.map")) + sorted(path.glob(f"{SAVED}/**/*.map"))
     if not found:
         raise MapFileError(f"no map in {path}: neither {TILES} nor *.map", reason="missing")
     return found

@@ -30,7 +30,7 @@ One server a map: it ends with exit code 2 where another one on the network serv
 token of one that has just crashed gets 12 s to vanish.
 Its maps survive restarts and crashes: every accepted cloud is on the disk before its receipt. server_started says
 where they are kept (--store) and how many clouds each holds. One server a store.
-Anyone who reaches the port may write: use Zenoh's access control and TLS.
+Anyone who reaches the port may write: `potserver acl` writes access rules and TLS.
 SIGTERM or Ctrl-C drains it: waiting clouds are mapped, everybody gets an answer, exit code 0. A second one
 ends it at once."""
 

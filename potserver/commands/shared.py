@@ -158,8 +158,8 @@ def _add_zenoh_flags(parser: argparse.ArgumentParser) -> None:
         "--cfg", action="append", default=[], metavar="KEY:VALUE", help="one Zenoh key, as JSON5"
     )
     zenoh.add_argument(
-        "--no-shm", action="store_const", dest="shared_memory", const=False,
-        help="no shared memory, e.g. in containers with a small /dev/shm",
+        "--shm", action=argparse.BooleanOptionalAction, dest="shared_memory",
+        help="clouds through shared memory: 4 to 8 times as fast, but every session leaves 18 MB [off]",
     )  # fmt: skip
 
 

@@ -269,6 +269,18 @@ class Occupancy:
     gradient: Float64 | None = None  # (N, 3) 1/m, of `mean`; 0 where unobserved; none unless asked for
     latent_gradient: Float64 | None = None  # (N, 3) log-odds/m, of `latent_mean`; likewise
 
+    @staticmethod
+    def concatenate(parts: list[Occupancy]) -> Occupancy:
+        """Answers of one map at the points of all parts, in order; at least one part."""
+        if len(parts) == 1:
+            return parts[0]
+        columns: dict[str, Any] = {
+            field.name: np.concatenate([getattr(part, field.name) for part in parts])
+            for field in dataclasses.fields(Occupancy)
+            if isinstance(getattr(parts[0], field.name), np.ndarray)
+        }
+        return Occupancy(map_revision=parts[0].map_revision, **columns)
+
 
 class Unknown(str, Enum):
     """What rays and robots take unobserved space for."""

@@ -100,13 +100,13 @@ class MapStore:
             fsync: Wait for the disk with each scan. Without, a crash of the machine may take the last ones; a crash of the
                 process does not.
             snapshot_scans, snapshot_bytes: A snapshot is written after so many scans, or so many bytes of the journal.
-            max_saved: Copies with a name that may lie in the folder `saved` of all maps.
+            max_saved: Copies with a name that may lie in `<folder>/saved/<map_id>`.
         Raises:
             StorageError: another server has the folder, or the disk refuses.
             MapFileError: a file in it is damaged, or of another version.
         """
         self.folder = folder / map_id
-        self._saved = folder / SAVED
+        self._saved = folder / SAVED / map_id
         self._map_id, self._keeps_evidence, self._health = map_id, keeps_evidence, health
         self._snapshot_scans, self._snapshot_bytes = snapshot_scans, snapshot_bytes
         self._max_saved, self._fsync = max_saved, fsync
@@ -296,7 +296,13 @@ class MapStore:
         path = self._saved / f"{name}.map"
         if not path.is_file():
             names = ", ".join(sorted(p.stem for p in self._saved.glob("*.map"))) or "none"
-            raise UnknownMapError(f"no map was saved as {name!r}; there are: {names}")
+            common = self._saved.parent / path.name
+            hint = (
+                f"; {common} is where all maps had their copies: move it to {path}"
+                if common.is_file()
+                else ""
+            )
+            raise UnknownMapError(f"no map was saved as {name!r}; there are: {names}{hint}")
         saved = read_map(path)
         self._check_fits(mapper, saved, path)
         revision = max(mapper.state.map_revision, saved.record.revision) + 1

@@ -23,26 +23,26 @@ def test_refusals_of_a_kind_are_counted_in_one_line(
     ours = Audit("site")
     with caplog.at_level("INFO", logger="potserver.audit"):
         for _ in range(5):
-            ours.refused("cloud", "r1", UnknownRobotError("no"), seq=3)
-        ours.refused("cloud", "r1", OverloadedError("full"))
+            ours.refused("clouds", "r1", UnknownRobotError("no"), seq=3)
+        ours.refused("clouds", "r1", OverloadedError("full"))
         now[0] += 2.0
-        ours.refused("cloud", "", UnknownRobotError("no"))
+        ours.refused("clouds", "", UnknownRobotError("no"))
     lines = lines_of(caplog)
     assert [(line["what"], line["who"], line["reason"], line["n"]) for line in lines] == [
-        ("cloud", "r1", "unknown_robot", 1),
-        ("cloud", "r1", "overloaded", 1),
-        ("cloud", "unnamed", "unknown_robot", 5),
+        ("clouds", "r1", "unknown_robot", 1),
+        ("clouds", "r1", "overloaded", 1),
+        ("clouds", "unnamed", "unknown_robot", 5),
     ]
     assert lines[0]["seq"] == 3
 
 
 def test_every_change_is_a_line(caplog: pytest.LogCaptureFixture) -> None:
     with caplog.at_level("INFO", logger="potserver.audit"):
-        Audit("site").changed("ctl/clear", "abc", result="the map is empty")
+        Audit("site").changed("control.clear", "abc", result="the map is empty")
     (line,) = lines_of(caplog)
     assert (line["event"], line["map_id"], line["what"], line["who"]) == (
         "change_made",
         "site",
-        "ctl/clear",
+        "control.clear",
         "abc",
     )

@@ -35,7 +35,7 @@ def test_the_default_is_a_quiet_client(monkeypatch: pytest.MonkeyPatch) -> None:
     assert value(config, "connect/endpoints") == [DEFAULT_ENDPOINT]
     assert value(config, "scouting/multicast/enabled") is False
     assert value(config, SHM_MESSAGES) == ["put"]
-    assert value(config, "transport/shared_memory/enabled") is True
+    assert value(config, "transport/shared_memory/enabled") is False
 
 
 def test_flags_win_over_cfg_and_cfg_over_the_file_and_the_file_over_ours(
@@ -64,10 +64,10 @@ def test_flags_win_over_cfg_and_cfg_over_the_file_and_the_file_over_ours(
     assert value(config, "connect/endpoints") == ["tcp/127.0.0.1:2", "tcp/127.0.0.1:3"]
     assert value(config, "scouting/multicast/enabled") is False
     config = build_config(
-        options_of("--cfg", 'mode:"router"', "-m", "peer", "--no-shm", "-l", "tcp/127.0.0.1:0")
+        options_of("--cfg", 'mode:"router"', "-m", "peer", "--shm", "-l", "tcp/127.0.0.1:0")
     )
     assert value(config, "mode") == "peer"
-    assert value(config, "transport/shared_memory/enabled") is False
+    assert value(config, "transport/shared_memory/enabled") is True
     assert value(config, "listen/endpoints") == ["tcp/127.0.0.1:0"]
 
 

@@ -348,7 +348,7 @@ def test_serve_help_says_who_may_write(capsys: pytest.CaptureFixture[str]) -> No
     with pytest.raises(SystemExit):
         cli.main(["serve", "--help"])
     text = " ".join(capsys.readouterr().out.split())
-    assert "Anyone who reaches the port may write: use Zenoh's access control and TLS." in text
+    assert "Anyone who reaches the port may write: `potserver acl` writes access rules and TLS." in text
     assert "security notes" not in text
 
 

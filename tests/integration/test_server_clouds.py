@@ -274,7 +274,7 @@ def test_a_cloud_without_a_pose_takes_the_one_at_its_stamp(make_rig: MakeRig) ->
 def test_a_cloud_waits_a_moment_for_the_pose_after_it(
     make_rig: MakeRig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("potserver.node.WAIT_S", DEADLINE_S)
+    monkeypatch.setattr("potserver.adapters.writer.WAIT_S", DEADLINE_S)
     rig = make_rig()
     client = rig.client()
     pose = pose_message(1_000_000_000, 1.0)
@@ -287,6 +287,43 @@ def test_a_cloud_waits_a_moment_for_the_pose_after_it(
     client.put(client.keys.pose("r1"), wire.encode(pose), wire.encoding_of(pose))
     assert waiting().status is ReceiptStatus.ACCEPTED
     np.testing.assert_allclose(rig.mapper.scans[0].T_map_sensor[0, 3], 2.0)
+
+
+def test_clouds_that_wait_for_their_pose_hold_up_no_other_robot(
+    make_rig: MakeRig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("potserver.adapters.writer.WAIT_S", DEADLINE_S)
+    rig = make_rig()
+    client = rig.client()
+    pose = pose_message(1_000_000_000, 1.0)
+    for i in range(8):
+        client.put(client.keys.pose(f"late{i}"), wire.encode(pose), wire.encoding_of(pose))
+    until(lambda: client.stats().counters.get("poses.accepted") == 8, "the poses")
+    ahead = make_cloud(T_map_sensor=None, stamp_ns=1_100_000_000)
+    waiting = [
+        in_background(lambda i=i: client.get(client.keys.integrate(f"late{i}"), ahead)) for i in range(8)
+    ]
+    until(lambda: client.stats().queues["clouds.depth"] == 8, "eight clouds waiting")
+    for seq in range(3):
+        assert client.one("integrate", make_cloud(seq=seq, robot="swift")).status is ReceiptStatus.ACCEPTED
+    assert client.stats().queues["clouds.depth"] == 8
+    pose = pose_message(1_200_000_000, 3.0)
+    for i in range(8):
+        client.put(client.keys.pose(f"late{i}"), wire.encode(pose), wire.encoding_of(pose))
+    for result in waiting:
+        (receipt,) = result()
+        assert receipt.status is ReceiptStatus.ACCEPTED
+        assert receipt.wait_ms > 0
+
+
+def test_a_pose_that_does_not_come_is_named(make_rig: MakeRig) -> None:
+    client = make_rig().client()
+    pose = pose_message(1_000_000_000, 1.0)
+    client.put(client.keys.pose("r1"), wire.encode(pose), wire.encoding_of(pose))
+    until(lambda: client.stats().counters.get("poses.accepted") == 1, "a pose")
+    error = client.error("integrate", make_cloud(T_map_sensor=None, stamp_ns=1_100_000_000))
+    assert error.code is ErrorCode.NO_POSE
+    assert "ends 100.0 ms before it" in error.message
 
 
 def test_bad_poses_are_counted(make_rig: MakeRig) -> None:

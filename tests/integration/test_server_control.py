@@ -121,10 +121,10 @@ def test_changes_and_refusals_are_audit_lines_with_who_and_what(
         client.error("points", b"no message")
     told = [record.msg for record in caplog.records if record.name == "potserver.audit"]
     assert [(line["event"], line["what"], line.get("reason")) for line in told] == [
-        ("change_made", "ctl/clear", None),
-        ("refused", "ctl/load", "bad_message"),
-        ("refused", "integrate", "unknown_robot"),
-        ("refused", "q/points", "bad_message"),
+        ("change_made", "control.clear", None),
+        ("refused", "control.load", "bad_message"),
+        ("refused", "queries.integrate", "unknown_robot"),
+        ("refused", "queries.points", "bad_message"),
     ]
     assert told[0]["who"] == str(client.session.zid())
     assert all(line["map_id"] == "default" and line["timestamp"] for line in told)

@@ -136,6 +136,21 @@ def test_a_full_map_takes_no_cloud_until_there_is_room(serve: Serve) -> None:
     assert taken.status.value == "accepted"
 
 
+def test_copies_belong_to_their_map(serve: Serve, tmp_path: Path) -> None:
+    server, ground = serve(maps=["ground", "roof"])
+    ground.close()
+    with contextlib.closing(Client(server.endpoint, map_id="ground")) as ground:
+        ground.control("save", named("copy"))
+    saved = tmp_path / "store" / "saved"
+    assert [path.relative_to(saved).as_posix() for path in saved.rglob("*.map")] == ["ground/copy.map"]
+    with contextlib.closing(Client(server.endpoint, map_id="roof")) as roof:
+        assert roof.control("load", named("copy")).code is ErrorCode.UNKNOWN_MAP
+        (saved / "ground" / "copy.map").rename(saved / "copy.map")  # where all maps had their copies before
+        error = roof.control("load", named("copy"))
+        assert error.code is ErrorCode.UNKNOWN_MAP
+        assert f"move it to {saved / 'roof' / 'copy.map'}" in error.message
+
+
 def test_names_where_they_belong_and_nowhere_else(serve: Serve) -> None:
     _, client = serve()
     assert client.control("load").code is ErrorCode.BAD_MESSAGE

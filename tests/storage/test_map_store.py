@@ -335,7 +335,7 @@ def test_saved_maps_are_bounded_in_number(tmp_path: Path, open_map: OpenMap) -> 
     ours.store.save("a", ours.mapper, {})
     with pytest.raises(TooLargeError, match="the limit is 1"):
         ours.store.save("b", ours.mapper, {})
-    assert [path.name for path in (tmp_path / "saved").iterdir()] == ["a.map"]
+    assert [path.name for path in (tmp_path / "saved" / "default").iterdir()] == ["a.map"]
 
 
 def test_maps_without_evidence_are_kept_too(tmp_path: Path, open_map: OpenMap) -> None:
@@ -356,7 +356,7 @@ def test_imported_kernels_are_not_taken_for_a_map_of_evidence(tmp_path: Path, op
     paper = MappingService(settings=MappingSettings.of_profile("paper"), threads=1)
     paper.integrate(make_scan(1))
     state = dataclasses.replace(paper.state, n_scans=0)
-    write_map(tmp_path / "saved" / "kernels.map", state, Origin("default", False, {}))
+    write_map(tmp_path / "saved" / "default" / "kernels.map", state, Origin("default", False, {}))
     ours = open_map(tmp_path)
     before = ours.state
     with pytest.raises(MapFileError, match="other profile"):
@@ -366,7 +366,7 @@ def test_imported_kernels_are_not_taken_for_a_map_of_evidence(tmp_path: Path, op
 
 def test_a_map_of_other_tiles_is_refused_and_nothing_changes(tmp_path: Path, open_map: OpenMap) -> None:
     state = _other_state(tile_size_m=5.0)
-    write_map(tmp_path / "saved" / "small.map", state, Origin("default", True, {}))
+    write_map(tmp_path / "saved" / "default" / "small.map", state, Origin("default", True, {}))
     ours = open_map(tmp_path)
     ours.take(make_scan(1))
     before = ours.state
@@ -487,7 +487,7 @@ def test_a_file_that_was_cut_off_is_refused_with_what_to_do(
     crashed: tuple[Path, MapState], tmp_path: Path, file: str
 ) -> None:
     is_map = file.endswith(".map")
-    content = (crashed[0] / ("saved" if is_map else "default") / file).read_bytes()
+    content = (crashed[0] / ("saved/default" if is_map else "default") / file).read_bytes()
     (tmp_path / file).write_bytes(content[: len(content) // 2])
     read: Callable[[Path], Any] = _scans_of if file == JOURNAL else read_map
     with pytest.raises(MapFileError, match="Take another copy" if is_map else "Move it and its folder away"):
@@ -502,7 +502,7 @@ def test_a_damaged_file_is_the_same_map_or_an_error(
     folder = tmp_path / "store"
     is_map = file.endswith(".map")
     rng = random.Random(file)
-    source = crashed[0] / ("saved" if is_map else "default") / file
+    source = crashed[0] / ("saved/default" if is_map else "default") / file
     content = source.read_bytes()
     read: Callable[[Path], Any] = _scans_of if file == JOURNAL else lambda path: read_map(path).state()
     shutil.copy(source, tmp_path / file)
