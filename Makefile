@@ -16,7 +16,7 @@ export NUMBA_CACHE_DIR := $(CURDIR)/$(VENV)/numba-cache
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
 .DEFAULT_GOAL := help
-.PHONY: help venv demo test check lint format-check types imports schemas-check bench fix build images clean distclean
+.PHONY: help venv demo torture test check lint format-check types imports schemas-check bench fix build images clean distclean
 
 help: ## this list
 	@echo "usage: make TARGET [PYTHON=/path/to/python3] [ARGS='...']"
@@ -89,6 +89,9 @@ bench: $(READY) ## benchmarks; table here, numbers into out/bench/bench.json
 	@mkdir -p out/bench
 	@$(BIN)/python -m pytest benchmarks --benchmark-only --benchmark-json=out/bench/bench.json $(ARGS)
 	@echo "bench: results above, and in out/bench/bench.json"
+
+torture: $(READY) ## faults, damage, hostile messages and kills; some minutes. ARGS='--help' tells of longer runs
+	@$(BIN)/python benchmarks/torture.py $(ARGS)
 
 build: $(READY) ## wheels of potserver and of the torch-free potclient, into dist
 	$(BIN)/python -m hatchling build -d dist

@@ -2,10 +2,10 @@
 
     python benchmarks/kill.py --kills 100
 
-Two robots publish and one asks (`q/integrate`) while `potserver serve` runs as a process of its own on one store. It gets
-SIGKILL after a random time, at times while it starts, and is started again. What the journal and the log say then is the order
-in which scans entered the map: every acknowledged scan must be among them, each once. At the end the map on the disk is
-compared, tile by tile, with one that was fed the same scans in that order and never killed.
+Two robots publish and one asks (`in/<robot>/integrate`) while `potserver serve` runs as a process of its own on one store.
+It gets SIGKILL after a random time, at times while it starts, and is started again. What the journal and the log say then is
+the order in which scans entered the map: every acknowledged scan must be among them, each once. At the end the map on the disk
+is compared, tile by tile, with one that was fed the same scans in that order and never killed.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ from potserver.domain.map_state import MapState
 from potserver.domain.types import KernelSet, Scan, yaw_pose
 from potserver.mapping.service import MappingService
 from potserver.mapping.settings import MappingSettings
+from potserver.storage.agreement import JOURNAL, TILES
 from potserver.storage.journal import Journal
 from potserver.storage.map_file import read_map
-from potserver.storage.map_store import JOURNAL, TILES
 
 _BASE_NS = 1_700_000_000_000_000_000
 _MAPPING = {"max_range_m": 15.0, "beams_per_scan": 400}

@@ -10,7 +10,7 @@ from potclient.commands.completion import add_completion_flag
 from potclient.commands.parsers import CommandParser
 from potclient.errors import PotclientError
 from potschemas import __version__
-from potserver.commands import atoms, config, demo, maps, ros, serve
+from potserver.commands import acl, atoms, config, demo, maps, ros, serve
 from potserver.commands import eval as evaluation
 from potserver.commands.shared import EXIT_OK, EXIT_USAGE, Formatter, say
 from potserver.errors import PotserverError
@@ -49,7 +49,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"potserver {__version__}")
     add_completion_flag(parser)
     commands = parser.add_subparsers(title="commands", metavar="COMMAND")
-    for verb in (serve, ros, config, atoms, maps, evaluation, demo):
+    for verb in (serve, ros, config, atoms, maps, acl, evaluation, demo):
         verb.add(commands)
     return parser
 

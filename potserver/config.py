@@ -39,7 +39,7 @@ class IntakeSettings:
 
     max_queued: Annotated[int, "clouds that may wait, each map; one more is refused at once"] = 16
     robots: Annotated[tuple[str, ...], "robots that may send; none named: every legal id"] = ()
-    allow_old_stamps: Annotated[bool, "take clouds that are not newer than the robot's last accepted one"] = (
+    allow_repeats: Annotated[bool, "take clouds whose number is not above the last one of their session"] = (
         False
     )
     max_future_s: Annotated[
@@ -53,6 +53,7 @@ class QuerySettings:
 
     threads: Annotated[int, "questions in work at once"] = 2
     max_queued: Annotated[int, "questions that may wait, all maps; one more is refused at once"] = 64
+    deadline_s: Annotated[float, "for questions that name no deadline: nobody is taken to wait longer"] = 10.0
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -64,9 +65,9 @@ class PoseSettings:
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class AtomSettings:
-    """Changes of the atom dictionary over `q/atoms`."""
+    """Changes of the atom dictionary over `ctl/atoms`."""
 
-    writable: Annotated[bool, "whoever reaches the server may add and remove atoms"] = True
+    writable: Annotated[bool, "whoever may ask `ctl/atoms` may add and remove atoms"] = False
     save: Annotated[bool, "write each change to the file `dictionary`; else a restart forgets it"] = False
 
 
@@ -80,6 +81,7 @@ class StoreSettings:
     fsync: Annotated[bool, "wait for the disk with each cloud; else a power cut may take the last ones"] = (
         True
     )
+    read_only: Annotated[bool, "answer from what is kept, write nothing, and take no clouds"] = False
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -131,6 +133,7 @@ _RENAMED = {
     "mapping.fade_rate": "mapping.gone_odds",
     "mapping.fine_m": "mapping.resolution_m",
     "mapping.gap_m": "mapping.free_gap_m",
+    "intake.allow_old_stamps": "intake.allow_repeats",
 }
 _NOW_FIXED = {
     "": ("seed", "stats_period_s"),
@@ -373,5 +376,6 @@ def _check(s: Settings) -> None:
         not s.atoms.save or s.dictionary is not None,
         "the setting `dictionary` beside it: the built-in atoms belong to the program",
     )
+    need("store.read_only", not (s.store.read_only and s.store.directory == ""), "a store to read from")
     need("log.level", s.log.level in ("debug", "info", "warning", "error"), "debug, info, warning or error")
     need("log.format", s.log.format in ("auto", "json", "console"), "auto, json or console")

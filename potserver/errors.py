@@ -10,9 +10,15 @@ class PotserverError(Exception):
     retryable: bool = False
 
     def __init__(
-        self, message: str, *, retry_after_s: float | None = None, reason: str | None = None
+        self,
+        message: str,
+        *,
+        retry_after_s: float | None = None,
+        reason: str | None = None,
+        next_seq: int | None = None,
     ) -> None:
         super().__init__(message)
+        self.next_seq = next_seq  # of a cloud that would have been taken
         self.retry_after_s = retry_after_s
         self.reason = reason  # finer than the code, where one code has several
 
@@ -60,9 +66,21 @@ class OutOfRangeError(PotserverError):
 
 
 class OldStampError(PotserverError):
-    """The stamp is not newer than the last accepted cloud of this robot, or too far in the future."""
+    """The stamp is too far in the future."""
 
     code = "old_stamp"
+
+
+class OldSequenceError(PotserverError):
+    """The cloud's number is not above the last accepted one of its session; `next_seq` would be taken."""
+
+    code = "old_seq"
+
+
+class MapFullError(PotserverError):
+    """The map takes no more: its limit of bytes is reached, or that of robots."""
+
+    code = "map_full"
 
 
 class NoPoseError(PotserverError):
@@ -90,7 +108,7 @@ class AtomRefusedError(PotserverError):
 
 
 class ReadOnlyError(PotserverError):
-    """The server takes no changes of its dictionary."""
+    """The server takes no changes of its dictionary, or was started to change nothing at all."""
 
     code = "read_only"
 

@@ -1,5 +1,5 @@
 """Structured log events over the standard `logging` tree, so that an embedded server stays silent unless
-asked.
+asked. Values under keys that hold secrets are hidden.
 
 An event is a past-tense name plus fields: `log.info("scan_integrated", map_id=..., elapsed_ms=...)`. The
 process that owns the terminal calls `configure_logging` once; a program that embeds `MapServer` configures
@@ -14,9 +14,17 @@ from typing import Any, TextIO, cast
 
 import structlog
 
+from potschemas.redaction import redacted
+
+
+def _hide_secrets(_logger: Any, _method: str, event: Any) -> Any:
+    return redacted(event)
+
+
 _SHARED: list[Any] = [
     structlog.stdlib.add_log_level,
     structlog.processors.TimeStamper(fmt="iso", utc=True),
+    _hide_secrets,
 ]
 
 

@@ -5,16 +5,17 @@ from __future__ import annotations
 import collections
 import contextlib
 import time
-from collections.abc import Mapping
 from typing import NamedTuple, Protocol
 
 import zenoh
 
 from potschemas import keys
-from potserver.adapters.clouds import CloudDoor, CloudReader, CloudSubscriber
+from potserver.adapters.answers import Answers
+from potserver.adapters.audit import Audit
+from potserver.adapters.clouds import CloudDoor, CloudReader, CloudSubscriber, IntegrateQueryable
 from potserver.adapters.intake import IntakeQueue
 from potserver.adapters.outbox import Outbox
-from potserver.adapters.poses import WAIT_S, PoseBuffer, PoseSubscriber
+from potserver.adapters.poses import PoseBuffer, PoseSubscriber
 from potserver.adapters.presence import RobotWatch, ServerToken
 from potserver.adapters.query_pool import QueryPool
 from potserver.adapters.queryable import MapQueryable
@@ -22,10 +23,10 @@ from potserver.adapters.questions.control import ControlQueryable
 from potserver.adapters.questions.question import Served
 from potserver.adapters.questions.registry import QUESTIONS
 from potserver.adapters.receipts import ReceiptSender
-from potserver.adapters.stamps import StampOrder
-from potserver.adapters.writer import Keeper, MapWriter
+from potserver.adapters.writer import Bounds, Keeper, MapWriter
 from potserver.atoms.store import AtomStore
 from potserver.config import Settings
+from potserver.domain.order import CloudOrder, Heard
 from potserver.errors import ShuttingDownError
 from potserver.health import Health
 from potserver.log import get_logger
@@ -62,15 +63,13 @@ class MapNode:
     control and robots' tokens.
     """
 
-    def __init__(
-        self, mapper: MappingService, keeper: Keeper, newest_stamps: Mapping[str, int], shared: Shared
-    ) -> None:
+    def __init__(self, mapper: MappingService, keeper: Keeper, heard: Heard, shared: Shared) -> None:
         """Declare everything, and begin to work.
 
         Args:
             mapper: Of the map.
             keeper: Where the map survives.
-            newest_stamps: Of its robots, ns, from before.
+            heard: The last numbers of its robots, from before.
             shared: With the other maps of the server.
         """
         settings, limits, health = shared.settings, shared.settings.limits, shared.health
@@ -95,19 +94,14 @@ class MapNode:
             max_gap_s=settings.poses.max_gap_s,
             max_future_s=settings.intake.max_future_s,
             max_robots=limits.max_robots,
-            wait_s=WAIT_S,
         )
         writer = MapWriter(
             mapper,
             keeper,
-            stamps=StampOrder(
-                newest_stamps,
-                allow_old=settings.intake.allow_old_stamps,
-                max_future_s=settings.intake.max_future_s,
-                max_robots=limits.max_robots,
-            ),
+            order=CloudOrder(heard, allow_repeats=settings.intake.allow_repeats),
+            bounds=Bounds(settings.intake.max_future_s, limits.max_coordinate_m, limits.max_map_bytes),
             intake=self.intake,
-            reader=CloudReader(limits, poses, frozenset(settings.intake.robots)),
+            reader=CloudReader(limits, poses),
             receipts=self._receipts,
             health=health,
         )
@@ -132,24 +126,21 @@ class MapNode:
             mapper=self.mapper,
             atoms=shared.atoms,
             health=health,
+            audit=Audit(self.map_id),
             limits=limits,
             durable=durable,
         )
+        answers = Answers(served, shared.pool, deadline_s=settings.queries.deadline_s)
         return [
             PoseSubscriber(session, map_keys, poses=poses, health=health, allowed_robots=allowed),
             CloudSubscriber(session, map_keys, door),
-            MapQueryable(
-                session,
-                map_keys,
-                questions=QUESTIONS,
-                integrate=door.admit_query,
-                served=served,
-                pool=shared.pool,
-            ),
+            IntegrateQueryable(session, map_keys, door, health),
+            MapQueryable(session, map_keys, questions=QUESTIONS, answers=answers, health=health),
             ControlQueryable(
                 session,
                 map_keys,
                 served=served,
+                answers=answers,
                 intake=self.intake,
                 writer=writer,
                 withdraw=self.withdraw,

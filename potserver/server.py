@@ -21,14 +21,21 @@ import zenoh
 
 from potclient.client import MapClient
 from potschemas import __version__, keys, messages
-from potserver.adapters.presence import OtherServers
+from potserver.adapters.presence import OtherServers, SessionWatch
 from potserver.adapters.query_pool import QueryPool
 from potserver.adapters.questions.registry import warm_up
-from potserver.adapters.session import build_config, close_session, open_session
+from potserver.adapters.session import (
+    build_config,
+    close_session,
+    max_sessions_of,
+    open_session,
+    raise_file_limit,
+)
 from potserver.adapters.stats import StatsPublisher, stats_now
 from potserver.atoms.store import AtomStore
 from potserver.config import Settings, as_tree
 from potserver.domain.dictionary import AtomDictionary
+from potserver.domain.order import Heard
 from potserver.health import Health
 from potserver.log import get_logger
 from potserver.mapping.service import MappingService
@@ -36,6 +43,7 @@ from potserver.node import FLUSH_S, QUEUE_MESSAGES, MapNode, Shared
 from potserver.numerics.threads import default_threads
 from potserver.ros.bridge import Bridge
 from potserver.storage.map_store import MapStore, MemoryOnly
+from potserver.storage.read_only import ReadOnlyStore
 from potserver.web.listener import Served, WebListener
 
 log = get_logger("potserver.server")
@@ -75,7 +83,9 @@ class MapServer:
         self.nodes: dict[str, MapNode] = {}  # by map id; to look at
         self.pool: QueryPool | None = None
         self._stats: StatsPublisher | None = None
-        self._stores: dict[str, MapStore] = {}
+        self._sessions: SessionWatch | None = None
+        self._max_sessions = 0
+        self._stores: dict[str, MapStore | ReadOnlyStore] = {}
         self.web: WebListener | None = None
         self._ros: tuple[Bridge, MapClient] | None = None
         self._stopping = threading.Event()
@@ -172,6 +182,7 @@ class MapServer:
                 "queries.bytes": pool.n_bytes if pool else 0,
                 "outbox.prompt": sum(node.prompt.depth for node in nodes),
                 "outbox.bulk": sum(node.bulk.depth for node in nodes),
+                "sessions": self._sessions.n_open if self._sessions else 0,
             },
             maps={node.map_id: node.mapper.state for node in nodes},
         )
@@ -185,8 +196,9 @@ class MapServer:
     def _start(self, s: Settings) -> None:
         mappers = [self._make_map(map_id) for map_id in s.maps]
         config = build_config(s.zenoh, root=s.root, wire_guard_bytes=s.limits.wire_guard_bytes)
+        self._max_sessions = raise_file_limit(max_sessions_of(config))
         try:
-            stamps = [self._open_store(mapper) for mapper in mappers]
+            heard = [self._open_store(mapper) for mapper in mappers]
             self._session, self._endpoints = open_session(config)
         except BaseException:
             self._close_stores()
@@ -198,7 +210,7 @@ class MapServer:
                 others.refuse()
                 _warm_up(mappers[0])  # all maps share the compiled numerics
                 others.refuse()  # one that was warming up beside us
-            self._serve(self._session, mappers, stamps)
+            self._serve(self._session, mappers, heard)
         except BaseException:
             self._teardown(0.0)
             raise
@@ -210,9 +222,7 @@ class MapServer:
             store=s.store.directory or "memory only",
         )
 
-    def _serve(
-        self, session: zenoh.Session, mappers: list[MappingService], stamps: list[dict[str, int]]
-    ) -> None:
+    def _serve(self, session: zenoh.Session, mappers: list[MappingService], heard: list[Heard]) -> None:
         """Declare everything, and last say that the maps are there."""
         s = self.settings
         self.pool = QueryPool(
@@ -220,10 +230,11 @@ class MapServer:
             max_queued=s.queries.max_queued,
             max_queued_bytes=QUEUE_MESSAGES * s.limits.max_query_bytes,
         )
+        self._sessions = SessionWatch(session, self.pool.give_up, self._max_sessions)
         shared = Shared(s, session, self.pool, _atom_store(mappers, s), self.health)
-        for mapper, newest in zip(mappers, stamps, strict=True):
+        for mapper, numbers in zip(mappers, heard, strict=True):
             keeper = self._stores.get(mapper.map_id, MemoryOnly())
-            self.nodes[mapper.map_id] = MapNode(mapper, keeper, newest, shared)
+            self.nodes[mapper.map_id] = MapNode(mapper, keeper, numbers, shared)
         self._stats = StatsPublisher(session, keys.stats_key(s.root, s.server_id), self.stats, s.limits)
         for node in self.nodes.values():
             node.announce(s.server_id)
@@ -231,20 +242,21 @@ class MapServer:
             client = MapClient(map=s.ros.map or s.maps[0], root=s.root, session=session)
             self._ros = Bridge(session, client, s.ros, self.health), client
 
-    def _open_store(self, mapper: MappingService) -> dict[str, int]:
-        """Give a map what was kept of it; the newest stamps of its robots."""
+    def _open_store(self, mapper: MappingService) -> Heard:
+        """Give a map what was kept of it; the last numbers of its robots."""
         s = self.settings.store
         if not s.directory:
             return {}
-        store = MapStore(
-            Path(s.directory).expanduser(),
-            mapper.map_id,
-            keeps_evidence=mapper.keeps_evidence,
-            health=self.health,
-            fsync=s.fsync,
-        )
+        folder, map_id = Path(s.directory).expanduser(), mapper.map_id
+        store: MapStore | ReadOnlyStore
+        if s.read_only:
+            store = ReadOnlyStore(folder, map_id, keeps_evidence=mapper.keeps_evidence, health=self.health)
+        else:
+            store = MapStore(
+                folder, map_id, keeps_evidence=mapper.keeps_evidence, health=self.health, fsync=s.fsync
+            )
         self._stores[mapper.map_id] = store
-        return store.restore(mapper).stamps
+        return store.restore(mapper).heard
 
     def _close_ros(self) -> bool:
         """Take no more clouds from ROS, and withdraw our topics; those on their way to a map count as unknown."""
@@ -288,8 +300,9 @@ class MapServer:
         # subscribers live on through the drain, so that whoever still sends is told
         drained = [node.drain(deadline) for node in nodes]
         answered = self.pool is None or self.pool.close(FLUSH_S)
-        if self._stats is not None:
-            self._stats.close()
+        for part in (self._stats, self._sessions):
+            if part is not None:
+                part.close()
         ended = [node.close() for node in nodes]
         kept = self._close_stores()  # after the writers: a last snapshot of what they made
         clean = all(

@@ -10,6 +10,7 @@ with MapClient("tcp/127.0.0.1:7447", map="default") as client:
 from potclient.atoms import Atom
 from potclient.client import MapClient
 from potclient.errors import (
+    AccessError,
     AtomRefusedError,
     BadMessageError,
     BadPointsError,
@@ -23,9 +24,11 @@ from potclient.errors import (
     InternalError,
     LostReplyError,
     MapFileError,
+    MapFullError,
     MapServerError,
     NoPoseError,
     NoServerError,
+    OldSequenceError,
     OldStampError,
     OutOfRangeError,
     OverloadedError,
@@ -54,6 +57,7 @@ from potclient.session import SessionOptions
 from potschemas import __version__
 
 __all__ = [
+    "AccessError",
     "Atom",
     "AtomRefusedError",
     "BadMessageError",
@@ -73,12 +77,14 @@ __all__ = [
     "LostReplyError",
     "MapClient",
     "MapFileError",
+    "MapFullError",
     "MapMirror",
     "MapServerError",
     "MirrorUpdate",
     "NoPoseError",
     "NoServerError",
     "Occupancy",
+    "OldSequenceError",
     "OldStampError",
     "OutOfRangeError",
     "OverloadedError",

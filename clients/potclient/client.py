@@ -14,7 +14,7 @@ import numpy as np
 import zenoh
 from numpy.typing import ArrayLike, NDArray
 
-from potclient.arguments import map_keys
+from potclient.arguments import legal_id, map_keys
 from potclient.atoms import Atom
 from potclient.clouds import Clouds, cloud_message
 from potclient.errors import UsageError
@@ -61,7 +61,7 @@ class MapClient:
         session: An open Zenoh session to use instead of one of our own; it stays open when the client is closed.
     Raises:
         UsageError: an id, the root or an option is not legal.
-        NoServerError: nobody listens at the endpoint.
+        NoServerError: nobody listens at the endpoint. AccessError: somebody does, and does not let us in.
     """
 
     def __init__(
@@ -167,6 +167,18 @@ class MapClient:
     def on_receipt(self, callback: Callable[[Receipt], None] | None) -> None:
         self._clouds.on_receipt = callback
 
+    @property
+    def session(self) -> str:
+        """The run that this client's numbers belong to, drawn when the client was made.
+
+        A server takes a robot's clouds of one session in the order of their numbers, each once.
+        """
+        return self._clouds.session
+
+    @session.setter
+    def session(self, name: str) -> None:
+        self._clouds.session = legal_id(name, "session")
+
     def integrate(
         self,
         points: ArrayLike,
@@ -187,8 +199,8 @@ class MapClient:
             points: (N, 3) or (N, 2) m, sensor frame.
             T_map_sensor: (4, 4), rigid; None lets the server interpolate the robot's pose stream.
             is_return: (N,) bool, false = no echo, the beam was free up to this point; None = all are echoes.
-            seq: The robot's number of the cloud; None takes the next one.
-            stamp_ns: When the scan was taken, Unix time; None takes the clock. Stamps of a robot must grow.
+            seq: The robot's number of the cloud, which must grow; None takes the next one.
+            stamp_ns: When the scan was taken, Unix time; None takes the clock. It places the cloud in a pose stream.
         Raises:
             MapServerError: its subclass for the reason, when the cloud is not accepted; `receipt` is set if there was one.
             NoServerError, QueryTimeoutError, LostReplyError: see there. After the last two the cloud may or may not be in.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import logging
+import secrets
 import threading
 import time
 from collections.abc import Iterator
@@ -31,6 +32,7 @@ class Clouds:
     def __init__(self, link: Link, options: FeedOptions) -> None:
         self._link, self._options = link, options
         self.on_receipt = options.on_receipt
+        self.session = secrets.token_hex(8)
         self._lock = threading.RLock()
         self._feeds: dict[str, Feed] = {}
         self._numberings: dict[str, Numbering] = {}
@@ -48,11 +50,13 @@ class Clouds:
         self, cloud: messages.Cloud, *, seq: int | None, stamp_ns: int | None, timeout_s: float | None
     ) -> Receipt:
         """See `MapClient.integrate`."""
-        assert cloud.robot is not None
-        number, stamp_ns = self._numbering(cloud.robot).assign(seq, stamp_ns)
-        cloud = msgspec.structs.replace(cloud, seq=number, stamp_ns=stamp_ns)
+        robot = cloud.robot
+        assert robot is not None
+        number, stamp_ns = self._numbering(robot).assign(seq, stamp_ns)
+        cloud = msgspec.structs.replace(cloud, seq=number, stamp_ns=stamp_ns, session=self.session)
         started = time.monotonic()
-        reply = self._link.ask("integrate", cloud, messages.Receipt, timeout_s)
+        key = self._link.keys.integrate(robot)
+        reply = self._link.ask(key, cloud, messages.Receipt, timeout_s)
         receipt = Receipt(reply, round_trip_s=time.monotonic() - started)
         if (error := receipt.error()) is not None:
             raise error
@@ -72,6 +76,7 @@ class Clouds:
         if wait and timeout_s is None:
             timeout_s = 2.0 * self._options.receipt_timeout_s
         feed = self._feed(cloud.robot)
+        cloud = msgspec.structs.replace(cloud, session=self.session)
         return feed.offer(cloud, seq=seq, stamp_ns=stamp_ns, wait=wait, timeout_s=timeout_s)
 
     def pose(self, T_map_sensor: ArrayLike, *, stamp_ns: int | None, robot: str) -> None:
@@ -138,6 +143,7 @@ class Clouds:
             lambda cloud: link.put(publisher, cloud),
             numbering=self._numbering(robot),
             is_matched=lambda: is_matching(publisher),
+            explain=lambda: link.why_no_receipt(robot, is_matched=is_matching(publisher)),
             credit=self._options.credit,
             receipt_timeout_s=self._options.receipt_timeout_s,
         )

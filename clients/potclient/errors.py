@@ -22,6 +22,10 @@ class NoServerError(PotclientError):
     retryable = True
 
 
+class AccessError(PotclientError):
+    """Somebody is there and does not let this client in: its certificate, its password, or the kind of connection is wrong."""
+
+
 class QueryTimeoutError(PotclientError, TimeoutError):
     """A server took the question and did not answer in time, or a wait ended before its condition held."""
 
@@ -133,6 +137,18 @@ class OutOfRangeError(MapServerError):
     code = "out_of_range"
 
 
+class OldSequenceError(MapServerError):
+    """The cloud's number is not above the last one that was taken of its session; the message says what would be taken."""
+
+    code = "old_seq"
+
+
+class MapFullError(MapServerError):
+    """The map has as many bytes, or robots, as it may: clear it, forget a robot, or ask the operator."""
+
+    code = "map_full"
+
+
 class OldStampError(MapServerError):
     """The stamp is not newer than the last accepted cloud of this robot."""
 
@@ -164,7 +180,7 @@ class AtomRefusedError(MapServerError):
 
 
 class ReadOnlyError(MapServerError):
-    """The server takes no changes of its dictionary."""
+    """The server takes no changes of its dictionary, or was started to take nothing in at all."""
 
     code = "read_only"
 

@@ -9,6 +9,7 @@ a cloud that the server had to drop the feed pauses, longer each time, up to a s
 from __future__ import annotations
 
 import dataclasses
+import logging
 import secrets
 import threading
 import time
@@ -21,6 +22,8 @@ from potclient.errors import ClosedError, QueryTimeoutError, UsageError
 from potclient.results import FeedCounts, Receipt, TransportedParams
 from potschemas import messages
 from potschemas.messages import ReceiptStatus
+
+log = logging.getLogger("potclient")
 
 _MATCH_POLL_S = 0.02  # only while a cloud waits and no server listens
 _BACKOFF_S = (0.05, 1.0)  # after a cloud that the server dropped: first, longest
@@ -53,7 +56,7 @@ def first_number() -> int:
 
 
 class Numbering:
-    """The numbers and stamps of one robot's clouds; both only ever grow.
+    """The numbers of one robot's clouds, which only ever grow, and their stamps.
 
     Args:
         first: The first number; None takes one that no other process has.
@@ -62,16 +65,13 @@ class Numbering:
     def __init__(self, first: int | None = None) -> None:
         self._lock = threading.Lock()
         self._seq = (first_number() if first is None else first) - 1
-        self._stamp_ns = 0
 
     def assign(self, seq: int | None, stamp_ns: int | None) -> tuple[int, int]:
         """The number and stamp to send, chosen where they are None: the next number, the clock."""
         with self._lock:
             chosen_seq = self._seq + 1 if seq is None else seq
-            chosen_stamp = max(time.time_ns(), self._stamp_ns + 1) if stamp_ns is None else stamp_ns
             self._seq = max(self._seq, chosen_seq)
-            self._stamp_ns = max(self._stamp_ns, chosen_stamp)
-            return chosen_seq, chosen_stamp
+            return chosen_seq, time.time_ns() if stamp_ns is None else stamp_ns
 
 
 class _Sent:
@@ -90,6 +90,7 @@ class Feed:
         is_matched: Whether somebody takes this robot's clouds now; while nobody does, the newest cloud waits in the slot.
         credit: How many clouds may be without a receipt.
         receipt_timeout_s: After this long without a receipt a cloud counts as unknown and its credit returns.
+        explain: The likely cause of clouds coming to nothing, for people.
         clock: Monotonic seconds.
     """
 
@@ -102,10 +103,11 @@ class Feed:
         is_matched: Callable[[], bool],
         credit: int,
         receipt_timeout_s: float,
+        explain: Callable[[], str] = lambda: "no server takes clouds of this robot",
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.robot = robot
-        self._put, self._is_matched, self._clock = put, is_matched, clock
+        self._put, self._is_matched, self._explain, self._clock = put, is_matched, explain, clock
         self._numbering = numbering
         self._credit, self._receipt_timeout_s = credit, receipt_timeout_s
         self._changed = threading.Condition()
@@ -308,6 +310,8 @@ class Feed:
             self._expired[seq] = self._in_flight.pop(seq)
             self._unknown += 1
             self._changed.notify_all()
+            if self._unknown == 1 and not any(self._outcomes.values()):  # once, and only if none ever came
+                log.warning("no receipt for cloud %d of %s: %s", seq, self.robot, self._explain())
         while len(self._expired) > _MAX_EXPIRED:
             self._expired.popitem(last=False)
 
@@ -320,9 +324,4 @@ class Feed:
     def _wait_for(self, condition: Callable[[], bool], until: float | None, what: str) -> None:
         remaining = None if until is None else until - time.monotonic()
         if not self._changed.wait_for(lambda: condition() or self._closing, remaining):
-            why = (
-                ""
-                if self._is_matched()
-                else ": no server takes clouds of this robot (none there, or not allowed)"
-            )
-            raise QueryTimeoutError(f"{what} of {self.robot}{why}")
+            raise QueryTimeoutError(f"{what} of {self.robot}: {self._explain()}")

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import itertools
 import logging
 import math
 import threading
@@ -42,6 +43,7 @@ MessageT = TypeVar("MessageT", bound=Message)
 _JOIN_S = 3.0  # for callbacks that still run when a link is closed
 _DIAGNOSIS_TIMEOUT_S = 0.5  # how long a silent question waits for the tokens of servers
 # megabytes take lanes of their own, so that they do not delay short questions and answers on the same link
+_BULK_BYTES = 65_536  # of a question
 _BULK_LANES = {
     "integrate": zenoh.Priority.DATA_LOW,
     "grid": zenoh.Priority.DATA,
@@ -75,8 +77,7 @@ class Subscription:
 
     def close(self) -> None:
         """Stop; the callback may still be running once more when this returns."""
-        with contextlib.suppress(zenoh.ZError):
-            self._subscriber.undeclare()
+        undeclare(self._subscriber)
         self._on_close(self)
 
     def runs_on(self, thread: threading.Thread) -> bool:
@@ -104,7 +105,7 @@ class Link:
         session: An open one to use instead; it is left open at the end.
     Raises:
         UsageError: an option is not legal.
-        NoServerError: nobody listens at the endpoint.
+        NoServerError: nobody listens at the endpoint. AccessError: somebody does, and does not let us in.
     """
 
     def __init__(
@@ -116,7 +117,12 @@ class Link:
         self._lock = threading.RLock()
         self._alive: set[tuple[str, str]] = set()  # (server, map) of every liveliness token under the root
         self._servers_changed = threading.Condition()
-        self._queriers: dict[str, zenoh.Querier] = {}
+        self._queriers: dict[
+            tuple[str, bool], zenoh.Querier
+        ] = {}  # by key, and whether it is for large questions
+        self._numbers = itertools.count()  # of questions
+        self._calls_changed = threading.Condition()
+        self.n_calls = 0  # threads that are inside Zenoh for us
         self._declared: list[Any] = []
         self._subscriptions: list[Subscription] = []
         self._readers: weakref.WeakSet[Subscription] = weakref.WeakSet()  # all whose threads may still run
@@ -146,13 +152,14 @@ class Link:
         for subscription in subscriptions:
             subscription.close()
         for entity in declared:
-            with contextlib.suppress(zenoh.ZError):
-                entity.undeclare()
+            undeclare(entity)
         if self._owns_session:
             with contextlib.suppress(zenoh.ZError):
                 self._session.close()
         # A thread that comes back from Zenoh while the interpreter shuts down aborts the process.
         until = time.monotonic() + _JOIN_S
+        with self._calls_changed:
+            self._calls_changed.wait_for(lambda: not self.n_calls, _JOIN_S)
         for reader in list(self._readers):
             if not reader.runs_on(caller):
                 reader.join(max(0.0, until - time.monotonic()))
@@ -221,11 +228,11 @@ class Link:
 
     # --- questions -----------------------------------------------------------------------------------------------------------
 
-    def ask(self, op: str, request: Message, kind: type[MessageT], timeout_s: float | None) -> MessageT:
-        """The only reply to a question of the map: `points`, `grid`, ...
+    def ask(self, key: str, request: Message, kind: type[MessageT], timeout_s: float | None) -> MessageT:
+        """The only reply to a question.
 
         Args:
-            op: Which question.
+            key: What is asked: `keys.query("points")`, ...
             request: Its message.
             kind: Of the reply.
             timeout_s: For the reply; None = the link's.
@@ -235,28 +242,37 @@ class Link:
             BadReplyError: the reply is not of that kind.
             UsageError, ClosedError: nothing was asked.
         """
-        return next(self.stream(op, request, kind, timeout_s))
+        return next(self.stream(key, request, kind, timeout_s))
 
     def stream(
-        self, op: str, request: Message, kind: type[MessageT], timeout_s: float | None
+        self, key: str, request: Message, kind: type[MessageT], timeout_s: float | None
     ) -> Iterator[MessageT]:
         """Ask now; the iterator gives the replies as they come, at least one. Arguments and errors as for `ask`."""
-        samples = self.samples(self.keys.query(op), request, timeout_s)
+        samples = self.samples(key, request, timeout_s)
         return (decoded(sample.payload, kind) for sample in samples)
 
     def samples(self, key: str, request: Message, timeout_s: float | None) -> Iterator[zenoh.Sample]:
-        """Ask now, on any key; the iterator gives the replies as they come, undecoded. Errors as for `ask`."""
+        """Ask now; the iterator gives the replies as they come, undecoded. Errors as for `ask`."""
         timeout_s = self.timeout_s if timeout_s is None else timeout_s
         if not (math.isfinite(timeout_s) and timeout_s > 0):
             raise UsageError(f"timeout_s {timeout_s}: need a positive number of seconds")
         was_ready = bool(self.servers)
-        sent: dict[str, Any] = {"payload": encode(request), "encoding": encoding_of(request)}
+        payload = encode(request)
+        is_bulk = len(payload) > _BULK_BYTES
+        querier = self._querier(key, is_bulk=is_bulk)
+        sent: dict[str, Any] = {
+            "payload": payload,
+            "encoding": encoding_of(request),
+            # the server gives each session its share, and ends the questions of one that is gone
+            "source_info": zenoh.SourceInfo(querier.id, next(self._numbers)),
+        }
         if timeout_s == self.timeout_s:
-            replies = self._call(self._querier(key).get, **sent)
+            replies = self._call(querier.get, **sent)
         else:  # the time-out of a declared querier is fixed
-            replies = self._call(self._session.get, key, timeout=timeout_s, **sent, **_query_qos(key))
-        for_silence = functools.partial(self._silence, key, len(sent["payload"]), was_ready)
-        return self._checked(replies, key, timeout_s, for_silence)
+            qos = _query_qos(key, is_bulk=is_bulk)
+            replies = self._call(self._session.get, key, timeout=timeout_s, **sent, **qos)
+        for_silence = functools.partial(self._silence, key, len(payload), was_ready)
+        return self._checked(iter(replies), key, timeout_s, for_silence)
 
     def deadline_ms(self, timeout_s: float | None) -> float:
         """The deadline that a message carries, so that the server starts no work that nobody waits for."""
@@ -266,7 +282,7 @@ class Link:
         self, replies: Any, key: str, timeout_s: float, for_silence: Callable[[], PotclientError]
     ) -> Iterator[zenoh.Sample]:
         n = 0
-        for reply in replies:
+        while (reply := self._next(replies)) is not None:
             if reply.ok is not None:
                 n += 1
                 yield reply.ok
@@ -282,6 +298,11 @@ class Link:
             raise error
         if n == 0:
             raise for_silence()
+
+    def _next(self, replies: Any) -> Any:
+        """The next reply; None at the end."""
+        with self._inside():
+            return next(replies, None)
 
     def _silence(self, key: str, n_bytes: int, was_ready: bool) -> PotclientError:
         """Why a question got no answer at all. Zenoh reports all of these alike: as an empty list of replies.
@@ -324,23 +345,57 @@ class Link:
             " filter, or the server failed while answering"
         )
 
-    def _querier(self, key: str) -> zenoh.Querier:
+    def why_no_receipt(self, robot: str, *, is_matched: bool) -> str:
+        """The likely cause of a robot's clouds coming to nothing, in words; Zenoh tells a sender of none.
+
+        Args:
+            robot: Whose clouds.
+            is_matched: Whether somebody takes them.
+        """
+        if self.is_closed:
+            return "the client was closed"
+        if not self._session.info.transports():
+            return f"the connection to {self.where} is lost"
+        if not self.servers:
+            return f"no server at {self.where} serves map {self.keys.map_id!r}{self._other_maps_hint()}"
+        if not is_matched:
+            return f"a server is up and takes no clouds from this client: its access control lets others be {robot!r}"
+        return (
+            f"a server is up and gave no receipt: its access control may not let this client send as {robot!r} or hear its"
+            " receipts, the cloud may be above its size filter, or it is far behind"
+        )
+
+    def _querier(self, key: str, *, is_bulk: bool = False) -> zenoh.Querier:
         with self._lock:
             self.check_open()
-            querier = self._queriers.get(key)
+            querier = self._queriers.get((key, is_bulk))
             if querier is None:
-                querier = self._session.declare_querier(key, timeout=self.timeout_s, **_query_qos(key))
-                self._queriers[key] = querier
+                qos = _query_qos(key, is_bulk=is_bulk)
+                querier = self._session.declare_querier(key, timeout=self.timeout_s, **qos)
+                self._queriers[key, is_bulk] = querier
                 self._declared.append(querier)
             return querier
 
     def _call(self, function: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
-        self.check_open()
         try:
-            return function(*args, **kwargs)
+            with self._inside():
+                self.check_open()
+                return function(*args, **kwargs)
         except zenoh.ZError as error:
             self.check_open()
             raise LostReplyError(f"Zenoh: {error}") from error
+
+    @contextlib.contextmanager
+    def _inside(self) -> Iterator[None]:
+        """Be counted: `close` waits for whoever is inside Zenoh."""
+        with self._calls_changed:
+            self.n_calls += 1
+        try:
+            yield
+        finally:
+            with self._calls_changed:
+                self.n_calls -= 1
+                self._calls_changed.notify_all()
 
     # --- streams -------------------------------------------------------------------------------------------------------------
 
@@ -408,6 +463,12 @@ class Link:
             self._subscriptions.remove(subscription)
 
 
+def undeclare(entity: Any) -> None:
+    """End a declaration; one that another thread uses right now ("Already borrowed") goes with the session."""
+    with contextlib.suppress(zenoh.ZError, RuntimeError):
+        entity.undeclare()
+
+
 def is_matching(entity: zenoh.Publisher | zenoh.Querier) -> bool:
     """Whether somebody takes what is published, or answers what is asked."""
     status: Any = entity.matching_status  # an object that is always true; the stub says bool
@@ -426,9 +487,10 @@ def decoded(payload: zenoh.ZBytes, kind: type[MessageT]) -> MessageT:
         raise BadReplyError(f"{error}; do the versions of client and server differ?") from error
 
 
-def _query_qos(key: str) -> dict[str, Any]:
+def _query_qos(key: str, *, is_bulk: bool) -> dict[str, Any]:
     """The lane of a question; its replies take the same one. No consolidation: parts of one reply share a key."""
-    priority = _BULK_LANES.get(key.rsplit("/", 1)[-1], zenoh.Priority.INTERACTIVE_HIGH)
+    usual = zenoh.Priority.DATA if is_bulk else zenoh.Priority.INTERACTIVE_HIGH
+    priority = _BULK_LANES.get(key.rsplit("/", 1)[-1], usual)
     return {
         "consolidation": zenoh.ConsolidationMode.NONE,
         "congestion_control": zenoh.CongestionControl.BLOCK,

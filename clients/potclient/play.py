@@ -18,6 +18,7 @@ from potclient.holdout import HoldOut, LabelledPoints
 from potclient.metrics import Metrics, score
 from potclient.results import Receipt
 
+_RECORDED = "recorded"  # the session of clouds that are numbered by their stamps
 _ROUNDING = 1.001  # beams that were cut at the server's range end there, and not beyond
 
 
@@ -87,7 +88,7 @@ class Sending:
     rate_hz: float | None = None  # scans a second at most; None goes as fast as the receipts come
     lossless: bool = True  # wait for credit; false drops the older cloud as a live robot does
     acknowledged: bool = False  # send by `integrate` instead, one after the other
-    # Send the recorded stamps. A server refuses stamps that do not grow, and with them a second round.
+    # Send the recorded stamps, and number the scans by them: a server then refuses a second round of the same recording.
     keep_stamps: bool = False
 
 
@@ -117,6 +118,9 @@ def play(
     held_ranges_m: list[Float64] = []
     failure: PotclientError | KeyboardInterrupt | None = None
     previous, client.on_receipt = client.on_receipt, book.on_receipt
+    session = client.session
+    if sending.keep_stamps:
+        client.session = _RECORDED
     try:
         for index, recorded in enumerate(recording):
             scan = recorded
@@ -134,7 +138,7 @@ def play(
             raise
         failure = error
     finally:
-        client.on_receipt = previous
+        client.on_receipt, client.session = previous, session
     report = PlayReport(scans=book.finish(), elapsed_s=time.monotonic() - started, failure=failure)
     if hold_out is None or failure is not None:
         return report
@@ -184,6 +188,7 @@ class _Book:
             "is_return": scan.is_return,
             "robot": self._sending.robot,
             "stamp_ns": scan.stamp_ns if self._sending.keep_stamps else None,
+            "seq": scan.stamp_ns if self._sending.keep_stamps else None,
         }
         if self._sending.acknowledged:
             self._integrate(index, scan, cloud)

@@ -1,14 +1,17 @@
-"""Clouds on their way in: published on `in/<robot>/cloud`, or as the query `q/integrate`."""
+"""Clouds on their way in: published on `in/<robot>/cloud`, or asked with on `in/<robot>/integrate`."""
 
 from __future__ import annotations
 
 import zenoh
 
 from potschemas import keys, messages
+from potserver.adapters.audit import Audit
 from potserver.adapters.intake import CloudJob, IntakeQueue
-from potserver.adapters.key_exprs import check_robot_id, is_wild, sender_of
+from potserver.adapters.key_exprs import check_robot_id, sender_of
 from potserver.adapters.poses import PoseBuffer
+from potserver.adapters.queryable import Queryable
 from potserver.adapters.receipts import ReceiptSender
+from potserver.adapters.replies import asker_of, reply_error
 from potserver.codec import clouds as codec
 from potserver.codec.base import check_encoding, check_size
 from potserver.domain.types import Scan
@@ -48,23 +51,25 @@ class CloudDoor:
         self._admit(CloudJob(robot_id=robot_id, payload=sample.payload), str(sample.encoding))
 
     def admit_query(self, query: zenoh.Query) -> None:
-        """Take the cloud of a `q/integrate`; its receipt is the reply.
+        """Take the cloud of an `in/<robot>/integrate`; its receipt is the reply.
 
         Raises:
             UnsupportedError: the key is wild.
         """
-        if is_wild(query.key_expr):
-            raise UnsupportedError("integrate changes a map: name the map, wildcards are not taken")
-        job = CloudJob(robot_id=None, payload=query.payload or zenoh.ZBytes(b""), query=query)
+        robot_id = sender_of(query.key_expr)
+        if robot_id is None:
+            raise UnsupportedError(
+                "integrate changes a map: name the map and the robot, wildcards are not taken"
+            )
+        job = CloudJob(robot_id=robot_id, payload=query.payload or zenoh.ZBytes(b""), query=query)
         self._admit(job, None if query.encoding is None else str(query.encoding))
 
     def _admit(self, job: CloudJob, encoding: str | None) -> None:
         self._health.count("clouds.received")
-        patient = job.query is None  # publishers can be slowed down; other questions wait behind a query
+        patient = job.query is None  # publishers can be slowed down; the clouds of others wait behind a query
         try:
             check_size(job.n_bytes, self._limits.max_cloud_bytes, "cloud")
-            if job.robot_id is not None:
-                check_robot_id(job.robot_id, self._allowed_robots)
+            check_robot_id(job.robot_id, self._allowed_robots)
             check_encoding(encoding, messages.Cloud)
         except PotserverError as error:
             self._receipts.refuse(job, error, patient=patient)
@@ -95,20 +100,40 @@ class CloudSubscriber:
         self._subscriber.undeclare()
 
 
+class IntegrateQueryable(Queryable):
+    """`in/<robot>/integrate` of one map: clouds whose receipt is the reply."""
+
+    def __init__(
+        self, session: zenoh.Session, map_keys: keys.MapKeys, door: CloudDoor, health: Health
+    ) -> None:
+        self._door, self._health, self._audit = door, health, Audit(map_keys.map_id)
+        super().__init__(session, map_keys.integrate("*"))
+
+    def admit(self, query: zenoh.Query) -> None:
+        """Queue a cloud for the map's writer."""
+        self._health.count("queries.received")
+        self._door.admit_query(query)
+
+    def refuse(self, query: zenoh.Query, error: PotserverError) -> None:
+        """Count and send what is wrong, at once."""
+        self._health.count(f"queries.integrate.{error.code}")
+        self._audit.refused("queries.integrate", asker_of(query), error)
+        with query:
+            reply_error(query, error)
+
+
 class CloudReader:
     """Makes scans of queued clouds, on the writer's thread."""
 
-    def __init__(self, limits: Limits, poses: PoseBuffer, allowed_robots: frozenset[str]) -> None:
-        self._limits, self._poses, self._allowed_robots = limits, poses, allowed_robots
+    def __init__(self, limits: Limits, poses: PoseBuffer) -> None:
+        self._limits, self.poses = limits, poses
 
     def read(self, job: CloudJob) -> Scan:
         """The scan; a cloud without a pose takes the one of the robot's pose stream.
 
         Raises:
-            PotserverError: see `codec.clouds.decode_cloud`; UnknownRobotError: the robot may not send.
+            PotserverError: see `codec.clouds.decode_cloud`; `PoseNotYetError` if it may be read later.
         """
-        scan = codec.decode_cloud(
-            job.payload.to_bytes(), robot_id=job.robot_id, limits=self._limits, pose_at=self._poses.at
+        return codec.decode_cloud(
+            job.payload.to_bytes(), robot_id=job.robot_id, limits=self._limits, pose_at=self.poses.at
         )
-        check_robot_id(scan.robot_id, self._allowed_robots)
-        return scan

@@ -11,9 +11,9 @@ from typing import NamedTuple
 
 import zenoh
 
+from potserver.adapters.fairness import Bounds, make_room
 from potserver.errors import OverloadedError, PotserverError, ShuttingDownError
 
-INTEGRATE_LANE = ""  # all `q/integrate` clouds: whose they are is only known once they are decoded
 RETRY_AFTER_S = 0.5  # what a refused sender is advised to wait: about as long as a scan takes to map
 _MAX_BARRIERS = 16
 
@@ -22,9 +22,9 @@ _MAX_BARRIERS = 16
 class CloudJob:
     """One cloud, not decoded yet."""
 
-    robot_id: str | None  # from the key; None: `q/integrate`, the message says it
+    robot_id: str  # from the key; it may not be a legal id
     payload: zenoh.ZBytes
-    query: zenoh.Query | None = None  # `q/integrate` only: the receipt is its reply
+    query: zenoh.Query | None = None  # `in/<robot>/integrate`: the receipt is its reply
     arrived_s: float = dataclasses.field(default_factory=time.monotonic)
     n_bytes: int = dataclasses.field(init=False)
 
@@ -34,7 +34,7 @@ class CloudJob:
     @property
     def lane(self) -> str:
         """What fairness is between."""
-        return INTEGRATE_LANE if self.robot_id is None else self.robot_id
+        return self.robot_id
 
     def wait_ms(self) -> float:
         """Time since the cloud arrived."""
@@ -81,12 +81,13 @@ class IntakeQueue:
     def __init__(
         self, *, max_queued: int, max_queued_bytes: int, retry_after_s: float = RETRY_AFTER_S
     ) -> None:
-        self._max_queued, self._max_bytes, self._retry_after_s = max_queued, max_queued_bytes, retry_after_s
+        self._bounds, self._retry_after_s = Bounds(max_queued, max_queued_bytes), retry_after_s
         self._changed = threading.Condition()
         self._epochs: collections.deque[_Epoch] = collections.deque([_Epoch()])
         self._counts: collections.Counter[str] = collections.Counter()  # clouds of each lane
         self._sizes: collections.Counter[str] = collections.Counter()  # bytes of each lane
         self._n_bytes = 0
+        self._not_before: dict[str, float] = {}  # lanes whose first cloud waits for its pose, and how long
         self._busy = False
         self._admitting, self._closed = True, False
 
@@ -123,16 +124,14 @@ class IntakeQueue:
         with self._changed:
             if not self._admitting:
                 return [Refusal(job, ShuttingDownError("the server takes no more clouds"))]
-            victims = self._make_room(job)
+            victims = make_room(job, self._bounds, self._counts, self._sizes, self._newest_first)
             error = self._overloaded()
             if victims is None:
                 return [Refusal(job, error)]
             for victim in victims:
                 self._forget(victim)
             self._epochs[-1].lanes.setdefault(job.lane, collections.deque()).append(job)
-            self._counts[job.lane] += 1
-            self._sizes[job.lane] += job.n_bytes
-            self._n_bytes += job.n_bytes
+            self._add_counts(job)
             self._changed.notify_all()
             return [Refusal(victim, error) for victim in victims]
 
@@ -164,20 +163,47 @@ class IntakeQueue:
         with self._changed:
             while not self._closed:
                 epoch = self._epochs[0]
-                if epoch.lanes:
-                    lane, jobs = epoch.lanes.popitem(last=False)
+                now_s = time.monotonic()
+                lane = next((n for n in epoch.lanes if self._not_before.get(n, now_s) <= now_s), None)
+                if lane is not None:
+                    self._not_before.pop(lane, None)
+                    jobs = epoch.lanes.pop(lane)
                     job = jobs.popleft()
                     if jobs:
                         epoch.lanes[lane] = jobs  # to the back: the next robot is next
                     self._drop_counts(job)
                     self._busy = True
                     return job
-                if epoch.barrier is not None:
+                if epoch.barrier is not None and not epoch.lanes:
                     self._epochs.popleft()
                     self._busy = True
                     return epoch.barrier
-                self._changed.wait()
+                soonest_s = min((self._not_before[n] for n in epoch.lanes), default=None)
+                self._changed.wait(None if soonest_s is None else soonest_s - now_s)
             return None
+
+    def put_back(self, job: CloudJob, until_s: float) -> bool:
+        """A cloud that `take` gave cannot be mapped yet; its robot waits, and the others go on.
+
+        Args:
+            job: The cloud; it stays the first of its robot.
+            until_s: When it is given again at the latest, of `time.monotonic`; sooner if `wake` is called.
+        Returns:
+            False if the queue is closed; the caller must refuse the cloud.
+        """
+        with self._changed:
+            if self._closed:
+                return False
+            self._epochs[0].lanes.setdefault(job.lane, collections.deque()).appendleft(job)
+            self._not_before[job.lane] = until_s
+            self._add_counts(job)
+            return True
+
+    def wake(self, lane: str) -> None:
+        """What the first cloud of a robot waits for is there."""
+        with self._changed:
+            if self._not_before.pop(lane, None) is not None:
+                self._changed.notify_all()
 
     def done(self) -> None:
         """The work that `take` gave is finished."""
@@ -213,29 +239,9 @@ class IntakeQueue:
     def _overloaded(self) -> OverloadedError:
         return OverloadedError(
             f"the queue holds {self._counts.total()} clouds of {self._n_bytes} bytes;"
-            f" the limits are {self._max_queued} and {self._max_bytes}",
+            f" the limits are {self._bounds.max_queued} and {self._bounds.max_bytes}",
             retry_after_s=self._retry_after_s,
         )
-
-    def _make_room(self, job: CloudJob) -> list[CloudJob] | None:
-        """Clouds whose places the newcomer may have; None if it should not, or would still not fit."""
-        counts, sizes = self._counts.copy(), self._sizes.copy()
-        newest: dict[str, Iterator[CloudJob]] = {}
-        victims: list[CloudJob] = []
-        while True:
-            lacks_bytes = sizes.total() + job.n_bytes > self._max_bytes
-            if not lacks_bytes and counts.total() + 1 <= self._max_queued:
-                return victims
-            held, wanted = (sizes, job.n_bytes) if lacks_bytes else (counts, 1)
-            if not held.total():
-                return None
-            lane = held.most_common(1)[0][0]
-            victim = next(newest.setdefault(lane, self._newest_first(lane)))
-            counts[lane] -= 1
-            sizes[lane] -= victim.n_bytes
-            if lane == job.lane or held[lane] < held[job.lane] + wanted:
-                return None
-            victims.append(victim)
 
     def _newest_first(self, lane: str) -> Iterator[CloudJob]:
         for epoch in reversed(self._epochs):
@@ -250,6 +256,11 @@ class IntakeQueue:
                     del epoch.lanes[job.lane]
                 break
         self._drop_counts(job)
+
+    def _add_counts(self, job: CloudJob) -> None:
+        self._counts[job.lane] += 1
+        self._sizes[job.lane] += job.n_bytes
+        self._n_bytes += job.n_bytes
 
     def _drop_counts(self, job: CloudJob) -> None:
         self._counts[job.lane] -= 1

@@ -5,7 +5,7 @@ from __future__ import annotations
 import bisect
 import collections
 import threading
-import time
+from collections.abc import Callable
 
 import zenoh
 
@@ -23,9 +23,16 @@ from potserver.log import get_logger
 log = get_logger("potserver.poses")
 
 POSES_PER_ROBOT = 1024  # kept: 20 s at 50 Hz
-# for the stream to reach a cloud's stamp: a few of its periods. The writer stands still that long
-WAIT_S = 0.2
+WAIT_S = 0.2  # since a cloud came, for the stream to reach its stamp: a few of its periods
 _CHANNEL = 256  # a burst beyond this loses its oldest poses; interpolation bridges the hole
+
+
+class PoseNotYetError(NoPoseError):
+    """The robot's stream has not reached the stamp, and may still do so."""
+
+    def __init__(self, message: str, stamp_ns: int) -> None:
+        super().__init__(message)
+        self.stamp_ns = stamp_ns
 
 
 class PoseSubscriber:
@@ -82,7 +89,6 @@ class PoseBuffer:
         max_future_s: Poses further ahead of our clock are refused.
         max_robots: Robots kept; the one that has been silent longest goes first.
         max_per_robot: Poses kept of each.
-        wait_s: How long `at` waits for the stream to reach a stamp.
     """
 
     def __init__(
@@ -92,12 +98,11 @@ class PoseBuffer:
         max_future_s: float = 5.0,
         max_robots: int = 1024,
         max_per_robot: int = POSES_PER_ROBOT,
-        wait_s: float = 0.0,
     ) -> None:
         self._max_per_robot, self._max_robots = max_per_robot, max_robots
         self._max_gap_ns = int(max_gap_s * 1e9)
-        self._max_future_s, self._wait_s = max_future_s, wait_s
-        self._changed = threading.Condition()
+        self._max_future_s = max_future_s
+        self._lock = threading.Lock()
         self._tracks: collections.OrderedDict[str, _Track] = collections.OrderedDict()
 
     def add(self, robot_id: str, stamp_ns: int, T_map_sensor: Float64) -> None:
@@ -109,41 +114,59 @@ class PoseBuffer:
         """
         check_rigid(T_map_sensor)
         check_not_future(stamp_ns, self._max_future_s)
-        with self._changed:
+        with self._lock:
             track = self._tracks.setdefault(robot_id, _Track())
             self._tracks.move_to_end(robot_id)
             if len(self._tracks) > self._max_robots:
                 self._tracks.popitem(last=False)
             track.insert(stamp_ns, T_map_sensor, self._max_per_robot)
-            self._changed.notify_all()
+            tell = track.tell_if_reached()
+        if tell is not None:
+            tell()
 
     def at(self, robot_id: str, stamp_ns: int) -> Float64:
         """(4, 4) pose of a robot at a stamp, interpolated between its two neighbours.
 
-        Waits `wait_s` for the stream to reach the stamp; a robot without a stream is not waited for.
-
         Raises:
-            NoPoseError: no stream, the stamp is outside the buffer, or its neighbours are too far apart.
+            PoseNotYetError: the stream ends before the stamp.
+            NoPoseError: no stream, the stamp is before it, or its neighbours are too far apart.
         """
-        deadline = time.monotonic() + self._wait_s
-        with self._changed:
-            while True:
-                track = self._tracks.get(robot_id)
-                if track is None:
-                    raise NoPoseError(f"the cloud has no pose, and {robot_id} has sent no pose stream")
-                if stamp_ns <= track.stamps[-1]:
-                    return track.at(stamp_ns, self._max_gap_ns)
-                if not self._changed.wait(deadline - time.monotonic()):
-                    late_ms = (stamp_ns - track.stamps[-1]) / 1e6
-                    raise NoPoseError(
-                        f"the cloud has no pose, and the stream of {robot_id} ends {late_ms:.1f} ms before it"
-                    )
+        with self._lock:
+            track = self._tracks.get(robot_id)
+            if track is None:
+                raise NoPoseError(f"the cloud has no pose, and {robot_id} has sent no pose stream")
+            if stamp_ns > track.stamps[-1]:
+                late_ms = (stamp_ns - track.stamps[-1]) / 1e6
+                raise PoseNotYetError(
+                    f"the cloud has no pose, and the stream of {robot_id} ends {late_ms:.1f} ms before it",
+                    stamp_ns,
+                )
+            return track.at(stamp_ns, self._max_gap_ns)
+
+    def tell_when_reached(self, robot_id: str, stamp_ns: int, tell: Callable[[], None]) -> None:
+        """Call once the robot's stream reaches a stamp, at once if it has; a robot has one such wish, the latest."""
+        with self._lock:
+            track = self._tracks.get(robot_id)
+            if track is None:
+                return
+            track.awaited = (stamp_ns, tell)
+            reached = track.tell_if_reached()
+        if reached is not None:
+            reached()
 
 
 class _Track:
     def __init__(self) -> None:
         self.stamps: list[int] = []
         self.poses: list[Float64] = []
+        self.awaited: tuple[int, Callable[[], None]] | None = None  # a stamp, and who wants to know
+
+    def tell_if_reached(self) -> Callable[[], None] | None:
+        """Who is to be told now, outside the lock."""
+        if self.awaited is None or self.stamps[-1] < self.awaited[0]:
+            return None
+        tell, self.awaited = self.awaited[1], None
+        return tell
 
     def insert(self, stamp_ns: int, pose: Float64, max_poses: int) -> None:
         i = bisect.bisect_left(self.stamps, stamp_ns)

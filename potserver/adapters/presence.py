@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 
 import zenoh
 
@@ -13,6 +13,7 @@ from potserver.adapters.key_exprs import sender_of
 from potserver.errors import SettingsError
 from potserver.health import Health
 from potserver.log import get_logger
+from potserver.threads import spawn
 
 log = get_logger("potserver.presence")
 
@@ -99,6 +100,50 @@ class ServerToken:
     def undeclare(self) -> None:
         """Say that no more work should come here."""
         self._token.undeclare()
+
+
+class SessionWatch:
+    """Counts the sessions that are connected to us, and gives up the questions of those whose connection ended.
+
+    Of sessions behind a router we do not hear: deadlines end their questions. A token of the asker would travel through
+    routers, but anybody could undeclare another's.
+
+    Args:
+        session: Ours.
+        give_up: Ends the questions of a session, by its Zenoh id; how many there were.
+        max_sessions: How many may be there. Zenoh lets no more in, and tells nobody: so the log says when it is full.
+    """
+
+    def __init__(self, session: zenoh.Session, give_up: Callable[[str], int], max_sessions: int) -> None:
+        self._give_up, self._max_sessions = give_up, max_sessions
+        self._open: set[str] = set()
+        self._events = session.info.declare_transport_events_listener(
+            zenoh.handlers.FifoChannel(64), history=True
+        )
+        self._thread = spawn("session-watch", self._run)
+
+    @property
+    def n_open(self) -> int:
+        """Sessions that are connected now."""
+        return len(self._open)
+
+    def close(self) -> None:
+        """Follow no more."""
+        self._events.undeclare()
+        self._thread.join(1.0)
+
+    def _run(self) -> None:
+        for event in self._events:
+            zid = str(event.transport.zid)
+            if event.kind == zenoh.SampleKind.DELETE:
+                self._open.discard(zid)
+                n = self._give_up(zid)
+                if n:
+                    log.info("asker_gone", zid=zid, n_questions=n)
+            else:
+                self._open.add(zid)
+                if len(self._open) == self._max_sessions:
+                    log.warning("sessions_full", n_sessions=self._max_sessions)
 
 
 class RobotWatch:

@@ -7,18 +7,17 @@ transfer. When the bulk outbox is full, parameters are dropped and counted (`par
 
 from __future__ import annotations
 
-import math
 import time
-from collections.abc import Callable
 from typing import NamedTuple
 
 import zenoh
 
 from potschemas import messages
 from potschemas.keys import MapKeys
+from potserver.adapters.audit import Audit
 from potserver.adapters.intake import CloudJob, IntakeQueue
 from potserver.adapters.outbox import End, Outbox
-from potserver.adapters.replies import INTEGRATE, reply, reply_error
+from potserver.adapters.replies import reply, reply_error
 from potserver.codec.base import Wire, encode
 from potserver.codec.clouds import UNKNOWN_SEQ, decode_cloud_head
 from potserver.codec.kernels import encode_kernels
@@ -27,10 +26,7 @@ from potserver.domain.types import MapUpdate, Scan, TileChange
 from potserver.errors import PotserverError, TooLargeError
 from potserver.health import Health
 from potserver.limits import Limits
-from potserver.log import get_logger
 from potserver.mapping.service import MappingService
-
-log = get_logger("potserver.receipts")
 
 _MAX_TILES = 10_000  # in one tick: more than a receiver decodes at once
 
@@ -61,7 +57,7 @@ class ReceiptSender:
         self._mapper, self._intake, self._health = mapper, intake, health
         self._max_bytes = limits.max_cloud_bytes
         self._prompt, self._bulk = prompt, bulk
-        self._reported_s: dict[str, float] = {}
+        self._audit = Audit(keys.map_id)
 
     def accept(
         self, job: CloudJob, scan: Scan, update: MapUpdate, *, wait_ms: float, integrate_ms: float
@@ -73,7 +69,9 @@ class ReceiptSender:
             query = job.query
             self._bulk.post_now(
                 lambda: self._reply(
-                    query, encode_accepted(map_id, scan, update, waited, integrate_ms, with_kernels=True)
+                    query,
+                    scan.robot_id,
+                    encode_accepted(map_id, scan, update, waited, integrate_ms, with_kernels=True),
                 ),
                 ended=self._count_receipt,
             )
@@ -118,22 +116,15 @@ class ReceiptSender:
         waited, state = Waited(self._intake.depth, job.wait_ms()), self._mapper.state
         if job.query is not None:
             self._health.count(f"queries.integrate.{error.code}")
-            self._refuse_query(job.query, error)
+            self._refuse_query(job.query, job.robot_id, error)
             return
-        robot_id = job.robot_id or ""
+        robot_id = job.robot_id
         payload = None if isinstance(error, TooLargeError) and job.n_bytes > self._max_bytes else job.payload
         n_bytes = 0 if payload is None else job.n_bytes
 
         def send() -> None:
             seq = UNKNOWN_SEQ if payload is None else decode_cloud_head(payload.to_bytes()).seq
-            self._report(error)(
-                "scan_refused",
-                map_id=self._keys.map_id,
-                robot_id=robot_id,
-                seq=seq,
-                reason=error.code,
-                detail=str(error),
-            )
+            self._audit.refused("clouds", robot_id, error, seq=seq)
             wire = encode_refused(self._keys.map_id, robot_id, seq, error, waited, state)
             self._put(self._keys.receipt(robot_id), wire, zenoh.Priority.DATA_HIGH)
 
@@ -147,8 +138,9 @@ class ReceiptSender:
         self._put(self._keys.params(scan.robot_id), wire, zenoh.Priority.DATA)
         self._health.count("params.sent")
 
-    def _refuse_query(self, query: zenoh.Query, error: PotserverError) -> None:
+    def _refuse_query(self, query: zenoh.Query, robot_id: str, error: PotserverError) -> None:
         """Knows nothing of the cloud, whose bytes can go at once."""
+        self._audit.refused("queries.integrate", robot_id, error)
 
         def send() -> None:
             with query:
@@ -159,14 +151,6 @@ class ReceiptSender:
     def _count_receipt(self, end: End) -> None:
         self._health.count(f"receipts.{end.value}")
 
-    def _report(self, error: PotserverError) -> Callable[..., None]:
-        """One line a second and reason; the counters have them all."""
-        now_s = time.monotonic()
-        if now_s - self._reported_s.get(error.code, -math.inf) < 1.0:
-            return log.debug
-        self._reported_s[error.code] = now_s
-        return log.info
-
     def _put(self, key: str, wire: Wire, priority: zenoh.Priority) -> None:
         self._session.put(
             key,
@@ -176,9 +160,9 @@ class ReceiptSender:
             congestion_control=zenoh.CongestionControl.BLOCK,
         )
 
-    def _reply(self, query: zenoh.Query, wire: Wire) -> None:
+    def _reply(self, query: zenoh.Query, robot_id: str, wire: Wire) -> None:
         with query:
-            reply(query, self._keys.query(INTEGRATE), wire)
+            reply(query, self._keys.integrate(robot_id), wire)
             self._health.count("queries.integrate.ok")
 
 
@@ -193,7 +177,7 @@ def refusal(error: PotserverError) -> messages.ReceiptStatus:
 def encode_accepted(
     map_id: str, scan: Scan, update: MapUpdate, waited: Waited, integrate_ms: float, *, with_kernels: bool
 ) -> Wire:
-    """The receipt of a cloud that is in the map; with its kernels for `q/integrate`."""
+    """The receipt of a cloud that is in the map; with its kernels for `in/<robot>/integrate`."""
     return encode(
         messages.Receipt(
             map=map_id,
@@ -231,6 +215,7 @@ def encode_refused(
             wait_ms=waited.wait_ms,
             map_revision=state.map_revision,
             map_kernels=len(state.snapshot),
+            next_seq=messages.ABSENT if error.next_seq is None else error.next_seq,
         )
     )
 

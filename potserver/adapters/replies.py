@@ -10,7 +10,6 @@ from potschemas import messages
 from potserver.codec.base import Wire, check_encoding, check_size, encode_error
 from potserver.errors import PotserverError
 
-INTEGRATE = "integrate"  # the one `q/<op>` that is no question: the map's writer answers it
 BUG = "a bug of the server; the traceback is in its log"
 
 
@@ -24,6 +23,12 @@ def check_query(query: zenoh.Query, kind: type[messages.Message], max_bytes: int
     check_size(n_bytes, max_bytes, what)
     check_encoding(None if query.encoding is None else str(query.encoding), kind)
     return n_bytes
+
+
+def asker_of(query: zenoh.Query) -> str:
+    """The Zenoh session that asks, as far as the query says so; empty if it does not."""
+    source = query.source_info
+    return "" if source is None else str(source.source_id.zid)
 
 
 def payload_of(query: zenoh.Query) -> bytes:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import json
+import resource
 import socket
 import threading
 from collections.abc import Mapping
@@ -16,7 +17,7 @@ from typing import Annotated, Any
 
 import zenoh
 
-from potclient import zenoh_config
+from potclient import diagnosis, zenoh_config
 from potclient.errors import UsageError
 from potclient.zenoh_config import DEFAULT_ENDPOINT
 from potserver.errors import SettingsError
@@ -25,7 +26,11 @@ from potserver.log import get_logger
 log = get_logger("potserver.session")
 
 MAX_MESSAGE_BYTES = 64 * 2**20  # of one reassembled message; the library's default is 1 GiB
+MAX_SESSIONS = (
+    1_000  # of others at once, a file descriptor each; `--cfg transport/unicast/max_sessions:N` changes it
+)
 _FREE_PORT_TRIES = 5
+_OTHER_FILES = 256  # descriptors beside those of sessions: stores, logs, listeners, libraries
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -40,8 +45,9 @@ class ZenohSettings:
         default_factory=dict
     )
     shared_memory: Annotated[
-        bool, "puts between processes of one host may go through /dev/shm; off in small containers"
-    ] = True
+        bool | None,
+        "puts between processes of one host go through /dev/shm: fast, but every session leaves 18 MB; unset: off",
+    ] = None
 
 
 def build_config(settings: ZenohSettings, *, root: str, wire_guard_bytes: int) -> zenoh.Config:
@@ -61,7 +67,7 @@ def build_config(settings: ZenohSettings, *, root: str, wire_guard_bytes: int) -
         "mode": settings.mode,
         "connect/endpoints": settings.connect,
         "listen/endpoints": settings.listen,
-        "transport/shared_memory/enabled": None if settings.shared_memory else False,
+        zenoh_config.SHM_ENABLED: settings.shared_memory,
     }
     try:
         config = zenoh_config.build(
@@ -83,6 +89,7 @@ def build_config(settings: ZenohSettings, *, root: str, wire_guard_bytes: int) -
 
 def _built_in(root: str, wire_guard_bytes: int) -> dict[str, object]:
     return {
+        "transport/unicast/max_sessions": MAX_SESSIONS,
         "mode": "peer",
         "listen/endpoints": [DEFAULT_ENDPOINT],
         "timestamping/enabled": True,
@@ -108,6 +115,8 @@ def open_session(config: zenoh.Config) -> tuple[zenoh.Session, list[str]]:
     Raises:
         SettingsError: an endpoint cannot be opened; the message is one line with a hint.
     """
+    if (problem := diagnosis.missing_file(config)) is not None:
+        raise SettingsError(problem)
     wanted = _endpoints(config)
     tries = _FREE_PORT_TRIES if any(_wants_free_port(endpoint) for endpoint in wanted) else 1
     for attempt in range(1, tries + 1):
@@ -120,6 +129,27 @@ def open_session(config: zenoh.Config) -> tuple[zenoh.Session, list[str]]:
             if attempt == tries:  # else somebody took the free port between the look and the use
                 raise SettingsError(_explain(error, endpoints)) from error
     raise AssertionError("unreachable")
+
+
+def max_sessions_of(config: zenoh.Config) -> int:
+    """How many others may be connected at once, after the file and `--cfg`."""
+    return int(json.loads(config.get_json("transport/unicast/max_sessions")))
+
+
+def raise_file_limit(n_sessions: int) -> int:
+    """Let this process have a file descriptor a session, as far as the system allows; how many sessions fit.
+
+    With none left, Zenoh lets nobody in and logs nothing.
+    """
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    wanted = n_sessions + _OTHER_FILES
+    if soft != resource.RLIM_INFINITY and soft < wanted:
+        soft = wanted if hard == resource.RLIM_INFINITY else min(wanted, hard)
+        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+    fit = n_sessions if soft == resource.RLIM_INFINITY else min(n_sessions, soft - _OTHER_FILES)
+    if fit < n_sessions:
+        log.warning("file_limit_low", files=soft, sessions=fit, wanted=n_sessions)
+    return fit
 
 
 def close_session(session: zenoh.Session, timeout_s: float) -> bool:

@@ -3,23 +3,36 @@
 from __future__ import annotations
 
 import time
+from typing import NamedTuple
 
 from potserver.adapters.clouds import CloudReader
 from potserver.adapters.intake import CloudJob, IntakeQueue
+from potserver.adapters.poses import WAIT_S, PoseNotYetError
 from potserver.adapters.receipts import ReceiptSender
 from potserver.adapters.replies import BUG
-from potserver.adapters.stamps import StampOrder
+from potserver.adapters.stamps import check_not_future
 from potserver.domain.map_state import MapState
+from potserver.domain.order import CloudOrder
+from potserver.domain.tiles import MapSize, check_reach
 from potserver.domain.types import Float64, TileChange
-from potserver.errors import PotserverError
+from potserver.errors import MapFullError, PotserverError
 from potserver.health import Health
 from potserver.log import get_logger
 from potserver.mapping.service import MappingService
 from potserver.storage.map_store import MapStore, MemoryOnly
+from potserver.storage.read_only import ReadOnlyStore
 
 log = get_logger("potserver.writer")
 
-Keeper = MapStore | MemoryOnly
+Keeper = MapStore | MemoryOnly | ReadOnlyStore
+
+
+class Bounds(NamedTuple):
+    """What the writer refuses."""
+
+    max_future_s: float  # stamps so far ahead
+    max_coordinate_m: float  # of what is merged into the map
+    max_map_bytes: int  # no cloud enters a map of so many
 
 
 class MapWriter:
@@ -30,13 +43,16 @@ class MapWriter:
         mapper: MappingService,
         keeper: Keeper,
         *,
-        stamps: StampOrder,
+        order: CloudOrder,
+        bounds: Bounds,
         intake: IntakeQueue,
         reader: CloudReader,
         receipts: ReceiptSender,
         health: Health,
     ) -> None:
-        self._map_id, self._mapper, self._keeper, self._stamps = mapper.map_id, mapper, keeper, stamps
+        self._map_id, self._mapper, self._keeper, self._order = mapper.map_id, mapper, keeper, order
+        self._bounds = bounds
+        self._size = MapSize()
         self._intake, self._reader, self._receipts, self._health = intake, reader, receipts, health
 
     def run(self) -> None:
@@ -61,7 +77,7 @@ class MapWriter:
             StorageError: the store does not take it. The map is unchanged, as after any error here.
         """
         changed = self._mapper.clear(commit=lambda state: self._keeper.replace(state, {}))
-        self._stamps.replace({})  # the same log may be replayed into the empty map
+        self._order.replace({})  # the same log may be replayed into the empty map
         self._health.count("maps.cleared")
         self._tell(changed)
         log.info("map_cleared", map_id=self._map_id)
@@ -74,7 +90,7 @@ class MapWriter:
             UnsupportedError: the map is kept in memory only.
             StorageError: the store does not take it.
         """
-        done = self._keeper.save(name, self._mapper, self._stamps.newest)
+        done = self._keeper.save(name, self._mapper, self._order.heard)
         log.info("map_saved", map_id=self._map_id, name=name)
         return done
 
@@ -86,9 +102,9 @@ class MapWriter:
             UnknownMapError, MapFileError: there is no such map, or it cannot be used.
             StorageError: the store does not take it.
         """
-        state, stamps = self._keeper.load(name, self._mapper)
-        changed = self._mapper.restore(state, commit=lambda new: self._keeper.replace(new, stamps))
-        self._stamps.replace(stamps)
+        state, heard = self._keeper.load(name, self._mapper)
+        changed = self._mapper.restore(state, commit=lambda new: self._keeper.replace(new, heard))
+        self._order.replace(heard)
         self._health.count("maps.loaded")
         self._tell(changed)
         log.info("map_loaded", map_id=self._map_id, name=name, n_scans=self._mapper.n_scans)
@@ -100,9 +116,12 @@ class MapWriter:
         Raises:
             UnsupportedError: the map is kept in memory only.
             UnknownMapError, MapFileError: there is no such map, or it cannot be used.
+            OutOfRangeError: the transform takes it to where no map may be.
             StorageError: the store does not take it.
         """
         other, _ = self._keeper.load(name, self._mapper)
+        if other.tiled is not None:
+            check_reach(other.tiled, T_map_saved, self._bounds.max_coordinate_m)
         changed = self._mapper.merge(other, T_map_saved, commit=self._keep)
         self._health.count("maps.merged")
         self._tell(changed)
@@ -117,36 +136,60 @@ class MapWriter:
             UnsupportedError: the map keeps no evidence (profile `paper`).
             StorageError: the store does not take it.
         """
-        changed = self._mapper.remove_robot(robot_id, commit=self._keep)
+        heard = self._order.without(robot_id)
+        changed = self._mapper.remove_robot(robot_id, commit=lambda state: self._keeper.replace(state, heard))
+        self._order.replace(heard)  # it may send again what it had sent
         self._health.count("maps.robots_forgotten")
         self._tell(changed)
         log.info("robot_forgotten", map_id=self._map_id, robot_id=robot_id, n_tiles=len(changed.tiles))
         return f"nothing from {robot_id} is left, {len(changed.tiles)} tiles changed"
 
+    def _check_room(self) -> None:
+        n_bytes = self._size.of(self._mapper.state.tiled)
+        if n_bytes >= self._bounds.max_map_bytes:
+            raise MapFullError(
+                f"the map has {n_bytes} bytes, the limit is {self._bounds.max_map_bytes} (limits.max_map_bytes): save and clear"
+                " it, or forget a robot"
+            )
+
     def _keep(self, state: MapState) -> None:
-        self._keeper.replace(state, self._stamps.newest)
+        self._keeper.replace(state, self._order.heard)
 
     def _tell(self, changed: TileChange) -> None:
         snapshot = self._mapper.snapshot
         self._receipts.tick(snapshot.map_revision, len(snapshot), changed)
 
+    def _waits(self, job: CloudJob, error: PoseNotYetError) -> bool:
+        """Let a cloud wait for its pose, while others are mapped; False if it has waited long enough."""
+        until_s = job.arrived_s + WAIT_S
+        if time.monotonic() >= until_s or not self._intake.put_back(job, until_s):
+            return False
+        self._reader.poses.tell_when_reached(
+            job.robot_id, error.stamp_ns, lambda: self._intake.wake(job.robot_id)
+        )
+        return True
+
     def _integrate(self, job: CloudJob) -> None:
         wait_ms = job.wait_ms()
         try:
+            self._keeper.check_takes()
+            self._check_room()
             scan = self._reader.read(job)
-            self._stamps.check(scan.robot_id, scan.stamp_ns)
+            check_not_future(scan.stamp_ns, self._bounds.max_future_s)
+            self._order.check(scan.robot_id, scan.session, scan.seq)
             started_s = time.perf_counter()
             update = self._mapper.integrate(scan, commit=lambda: self._keeper.append(scan))
         except PotserverError as error:
-            self._receipts.refuse(job, error)
+            if not (isinstance(error, PoseNotYetError) and self._waits(job, error)):
+                self._receipts.refuse(job, error)
             return
         except Exception:
             log.exception("scan_failed", map_id=self._map_id, robot_id=job.robot_id)
             self._receipts.refuse(job, PotserverError(BUG))
             return
         integrate_ms = (time.perf_counter() - started_s) * 1e3
-        self._stamps.remember(scan.robot_id, scan.stamp_ns)
-        self._keeper.advance(self._mapper, self._stamps.newest)
+        self._order.remember(scan.robot_id, scan.session, scan.seq)
+        self._keeper.advance(self._mapper, self._order.heard)
         self._health.observe("integrate", integrate_ms)
         self._health.observe("clouds.wait", wait_ms)
         self._receipts.accept(job, scan, update, wait_ms=wait_ms, integrate_ms=integrate_ms)

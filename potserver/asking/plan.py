@@ -17,6 +17,8 @@ from potserver.limits import Limits
 
 PartT = TypeVar("PartT", covariant=True)
 
+_SHORT_SHARE = 16  # parts take some tens of milliseconds
+
 
 class Plan(ABC, Generic[PartT]):
     """A question that passed its checks. All parts come from one snapshot; each is computed when it is asked for."""
@@ -34,6 +36,11 @@ class Plan(ABC, Generic[PartT]):
     def n_parts(self) -> int:
         """At least one, which may be empty; the last one may be smaller."""
         return max(1, -(-self.n_items // self.part_size))
+
+    @property
+    def is_short(self) -> bool:
+        """About a millisecond of work, a small share of a part: it need not wait behind others."""
+        return self.n_items * _SHORT_SHARE <= self.part_size
 
     def items(self, i: int) -> slice:
         """The items of part i."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterable
 
 from numpy.typing import ArrayLike
 
@@ -12,6 +13,8 @@ from potserver.domain.types import Float64, Occupancy
 from potserver.errors import TooLargeError
 from potserver.limits import Limits
 
+PART_POINTS = 32_768  # of a part: some tens of milliseconds of work
+
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class Points:
@@ -20,7 +23,7 @@ class Points:
     points: ArrayLike  # (N, 3) or (N, 2) m, map frame
     with_gradient: bool = False  # answer the gradients of the mean and of the latent mean too
 
-    def plan(self, snapshot: KernelMap, limits: Limits) -> PointsPlan:
+    def plan(self, snapshot: KernelMap, limits: Limits, *, part_points: int = PART_POINTS) -> PointsPlan:
         """Check the question.
 
         Raises:
@@ -30,12 +33,12 @@ class Points:
         points = checked_points(self.points, limits)
         if len(points) > limits.max_query_points:
             raise TooLargeError(f"{len(points)} points in one query, the limit is {limits.max_query_points}")
-        return PointsPlan(snapshot, points, self.with_gradient, part_size=limits.max_query_points)
+        return PointsPlan(snapshot, points, self.with_gradient, part_size=part_points)
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class PointsPlan(Plan[Occupancy]):
-    """Points that passed their checks; they are answered in one part."""
+    """Points that passed their checks."""
 
     snapshot: KernelMap
     points: Float64  # (N, 3) m, map frame
@@ -48,8 +51,12 @@ class PointsPlan(Plan[Occupancy]):
         return len(self.points)
 
     def part(self, i: int) -> Occupancy:
-        """The answers at some of the points, in the order asked."""
+        """The answers at a run of the points, in the order asked."""
         points = self.points[self.items(i)]
         if self.with_gradient:
             return self.snapshot.occupancy_with_gradient(points)
         return self.snapshot.occupancy(points)
+
+    def result(self, parts: Iterable[Occupancy]) -> Occupancy:
+        """The answer, from all parts in order."""
+        return Occupancy.concatenate(list(parts))

@@ -6,6 +6,7 @@ import functools
 import math
 import re
 from enum import Enum
+from typing import NamedTuple
 
 import numpy as np
 
@@ -29,11 +30,15 @@ _MAX_PROVENANCE_CHARS = 4_000
 _MAX_RADIUS_M = 200.0
 _POINT_MARGIN_M = 0.1  # that points may lie outside the sector
 _KERNEL_MARGIN_M = 3.0  # that kernels may
-_MAX_ABS_WEIGHT = 500.0  # log-odds; the built-in atoms reach 58
+_MAX_ABS_WEIGHT = 150.0  # log-odds; the built-in atoms reach 58
+_MAX_RMS_WEIGHT = 25.0  # over the kernels; the built-in atoms reach 10.2
 _MAX_WEIGHT_VAR = 1_000.0  # log-odds^2; the built-in atoms reach 199
 _MIN_LENGTH_SCALE_M = 0.05  # 1 / sqrt(2 gamma)
 _MAX_LENGTH_SCALE_M = 20.0
 _MIN_AUC = 0.9  # of the atom's own hits over its own free points; the built-in atoms have 0.958 to 1
+_MAX_OWN_NLL = (
+    0.6  # of the answers at the atom's own points, each label alone; the built-in atoms reach .32 and .40
+)
 MIN_DISTANCE_M2 = 0.25  # to every other atom; the built-in atoms keep 2.3
 
 
@@ -53,6 +58,7 @@ class Refusal(str, Enum):
     KERNELS_OUTSIDE = "kernels_outside"
     WILD_KERNELS = "wild_kernels"  # weights, variances or widths out of range
     UNEXPLAINED = "unexplained"  # the kernels do not tell the atom's own hits from its own free points
+    UNCALIBRATED = "uncalibrated"  # they rank them, and say of one label that it is the other
     DUPLICATE = "duplicate"
 
 
@@ -81,23 +87,43 @@ def admit(
         _check_counts(atom)
         _check_place(atom)
         _check_kernels(atom)
-        own = own_auc(atom)
-        if own < _MIN_AUC:
-            raise _refused(
-                Refusal.UNEXPLAINED,
-                f"its kernels tell its own hits from its own free points with AUC {own:.3f}, need {_MIN_AUC}: learn it again",
-            )
+        _check_own_points(atom)
         _check_new(atom, dictionary, min_distance_m2, threads)
 
 
-def own_auc(atom: Atom) -> float:
-    """How well the kernels rank the points that they were learned from, hits over free points: 0.5 is a guess.
+class OwnFit(NamedTuple):
+    """How the kernels answer at the points that they were learned from. It says nothing about accuracy on other data."""
 
-    Near 1 for any sound atom. It says nothing about accuracy on other data.
-    """
-    rank = KernelMap(atom.kernels, rule=AnswerRule(observed_activation=1e-3), threads=1)
-    hits, free = (rank.occupancy(points).latent_mean for points in (atom.hit_points, atom.free_points))
-    return auc(hits, free)
+    auc: float  # hits over free points: 0.5 is a guess, near 1 for any sound atom
+    nll_hits: float  # mean of -ln p(occupied)
+    nll_free: float  # mean of -ln p(free)
+
+
+def own_fit(atom: Atom) -> OwnFit:
+    """Ask an atom at its own points; it has points of both labels."""
+    own = KernelMap(atom.kernels, rule=AnswerRule(observed_activation=1e-3), threads=1)
+    hits, free = (own.occupancy(points) for points in (atom.hit_points, atom.free_points))
+    return OwnFit(auc(hits.latent_mean, free.latent_mean), _nll(hits.mean), _nll(1.0 - free.mean))
+
+
+def _nll(p: Float64) -> float:
+    return float(-np.log(np.clip(p, 1e-6, 1.0)).mean())
+
+
+def _check_own_points(atom: Atom) -> None:
+    """A map is only as good as what is carried into it: a ranking alone would let kernels pass that call everything free."""
+    own = own_fit(atom)
+    if own.auc < _MIN_AUC:
+        raise _refused(
+            Refusal.UNEXPLAINED,
+            f"its kernels tell its own hits from its own free points with AUC {own.auc:.3f}, need {_MIN_AUC}: learn it again",
+        )
+    for name, nll in (("hits", own.nll_hits), ("free points", own.nll_free)):
+        if not nll <= _MAX_OWN_NLL:
+            raise _refused(
+                Refusal.UNCALIBRATED,
+                f"its kernels answer at its own {name} with NLL {nll:.2f}, need {_MAX_OWN_NLL}: learn it again",
+            )
 
 
 def _check_record(atom: Atom, dictionary: AtomDictionary, max_atoms: int) -> None:
@@ -174,9 +200,11 @@ def _outside(atom: Atom, points: Float32 | Float64) -> Float64:
 
 def _check_kernels(atom: Atom) -> None:
     kernels = atom.kernels
+    rms = np.sqrt(np.square(kernels.weight_mean.astype(np.float64)).mean())
     length_scale = 1.0 / np.sqrt(2.0 * kernels.gamma.astype(np.float64))
     for name, values, low, high in (
         ("weight", kernels.weight_mean, -_MAX_ABS_WEIGHT, _MAX_ABS_WEIGHT),
+        ("root mean square of the weights", rms, 0.0, _MAX_RMS_WEIGHT),
         ("weight variance", kernels.weight_var, 1e-9, _MAX_WEIGHT_VAR),
         ("length scale", length_scale, _MIN_LENGTH_SCALE_M, _MAX_LENGTH_SCALE_M),
         # a position that is less sure than the kernel is wide says nothing

@@ -12,6 +12,8 @@ from potserver.domain.dictionary import AtomDictionary
 from potserver.domain.types import Atom
 from potserver.errors import ReadOnlyError
 
+MAX_ADDED = 100  # atoms: every scan is compared with each, which takes it about 5 ms on one core
+
 
 class AtomChange(NamedTuple):
     """A change that was made."""
@@ -31,6 +33,7 @@ class AtomStore:
         *,
         writable: bool = True,
         file: Path | None = None,
+        max_atoms: int = MAX_ADDED,
         threads: int = 1,
     ) -> None:
         """Hold a dictionary.
@@ -40,10 +43,12 @@ class AtomStore:
             use: Called with the new dictionary after each change.
             writable: Whether changes are taken at all.
             file: Where each change is written before it counts; None keeps changes in memory.
+            max_atoms: That additions may lead to; a dictionary that begins with more only shrinks.
             threads: Threads that one change may use.
         """
         self._dictionary, self._use = dictionary, use
         self._writable, self._file, self._threads = writable, file, threads
+        self._max_atoms = max_atoms
         self._lock = threading.Lock()
 
     @property
@@ -60,7 +65,7 @@ class AtomStore:
         """
         self._check_writable()
         with self._lock:
-            admit(atom, self._dictionary, threads=self._threads)
+            admit(atom, self._dictionary, max_atoms=self._max_atoms, threads=self._threads)
             return self._change(atom.atom_id, self._dictionary.add(atom))
 
     def remove(self, atom_id: str) -> AtomChange:
@@ -82,4 +87,7 @@ class AtomStore:
 
     def _check_writable(self) -> None:
         if not self._writable:
-            raise ReadOnlyError("this server takes no changes of its dictionary (atoms.writable is false)")
+            raise ReadOnlyError(
+                "this server takes no changes of its dictionary (atoms.writable is false); its operator may start it"
+                " with --set atoms.writable=true"
+            )

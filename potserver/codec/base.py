@@ -50,13 +50,13 @@ def check_encoding(encoding: str | None, kind: type[messages.Message]) -> None:
 
 
 def decode(payload: bytes, kind: type[MessageT], max_bytes: int = MAX_SMALL_BYTES) -> MessageT:
-    """One message; an empty payload stands for a message whose fields all have defaults.
+    """One request; an empty payload stands for a message whose fields all have defaults.
 
     Raises:
         BadMessageError, ShapeError, TooLargeError: see `potschemas.wire.decode`.
     """
     with typed_errors():
-        return wire.decode(payload or b"\x80", kind, wire.WireLimits(max_bytes=max_bytes))
+        return wire.decode(payload or b"\x80", kind, wire.request_limits(max_bytes))
 
 
 def decode_array(array: messages.Array, name: str, dtypes: tuple[DType, ...], shape: Shape) -> NDArray[Any]:

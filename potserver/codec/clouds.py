@@ -43,7 +43,7 @@ class _CloudHead(messages.Message, frozen=True, kw_only=True):
 def decode_cloud_head(payload: bytes) -> CloudHead:
     """The number and sender of a cloud; `UNKNOWN_SEQ` when even they cannot be read."""
     try:
-        head = wire.decode(payload, _CloudHead)
+        head = wire.decode(payload, _CloudHead, wire.request_limits(len(payload)))
     except wire.WireError:
         return CloudHead(UNKNOWN_SEQ, None)
     return CloudHead(head.seq, head.robot)
@@ -51,11 +51,11 @@ def decode_cloud_head(payload: bytes) -> CloudHead:
 
 @np.errstate(over="ignore", invalid="ignore")  # hostile numbers may overflow on the way to their error
 def decode_cloud(payload: bytes, *, robot_id: str | None, limits: Limits, pose_at: PoseAt) -> Scan:
-    """A scan from the payload of `in/<robot>/cloud` or `q/integrate`.
+    """A scan from the payload of `in/<robot>/cloud` or `in/<robot>/integrate`.
 
     Args:
         payload: A `messages.Cloud`.
-        robot_id: From the key; None where the message must say it.
+        robot_id: From the key; None for a kept cloud, which says it itself.
         limits: Bounds on bytes, points and coordinates.
         pose_at: Called when the cloud brings no pose.
     Raises:
@@ -93,6 +93,7 @@ def decode_cloud(payload: bytes, *, robot_id: str | None, limits: Limits, pose_a
     _check_placed(xyz, pose, limits.max_coordinate_m)
     return Scan(
         robot_id=sender,
+        session="" if cloud.session is messages.ABSENT else cloud.session,
         seq=cloud.seq,
         stamp_ns=cloud.stamp_ns,
         points=xyz,
@@ -112,6 +113,7 @@ def encode_cloud(scan: Scan) -> bytes:
             T_map_sensor=wire.encode_array(scan.T_map_sensor),
             is_return=None if scan.is_return.all() else wire.encode_array(scan.is_return),
             robot=scan.robot_id,
+            session=scan.session or messages.ABSENT,
         )
     )
 
@@ -151,7 +153,7 @@ def decode_transform(array: messages.Array, name: str) -> Float64:
 def _sender(cloud: messages.Cloud, robot_id: str | None) -> str:
     if robot_id is None:
         if cloud.robot is None:
-            raise BadMessageError("pot.cloud.v1: q/integrate needs the field `robot`")
+            raise BadMessageError("pot.cloud.v1: a cloud that is kept needs the field `robot`")
         return cloud.robot
     if cloud.robot not in (None, robot_id):
         raise BadMessageError(

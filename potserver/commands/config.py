@@ -9,6 +9,7 @@ import re
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
+from potschemas.redaction import redacted
 from potserver.commands.shared import EXIT_OK, add_group, add_settings_flags, add_verb, say, settings_of
 
 if TYPE_CHECKING:
@@ -40,7 +41,10 @@ def _show(options: argparse.Namespace) -> int:
         say(to_markdown(describe(Settings())))
     else:
         settings = settings_of(options)
-        say(json.dumps(as_tree(settings), indent=2) if options.json else to_toml(describe(settings)))
+        if options.json:
+            say(json.dumps(redacted(as_tree(settings)), indent=2))
+        else:
+            say(to_toml(leaf._replace(value=redacted(leaf.value)) for leaf in describe(settings)))
     return EXIT_OK
 
 

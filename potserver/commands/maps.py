@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from potclient.commands import export_flags, pose_flag
 from potclient.commands.output_files import file_in_new_folder
 from potclient.octomap import DEPTH, KEY_ORIGIN, Leaves, read_bt
+from potserver.commands import map_care
 from potserver.commands.shared import (
     EXIT_OK,
     add_group,
@@ -53,7 +54,7 @@ examples:
   potserver map export site.map -f pgm --resolution 0.05 --band 0.1 1.5 -o map.pgm"""
 
 _IMPORT = """\
-Make a *.map file. In the folder `saved` of a server's store, `potclient map load NAME` finds it.
+Make a *.map file. In the folder `saved/<map>` of a server's store, `potclient map load NAME` finds it.
 
   *.bt        a binary OctoMap: its voxels become evidence of a robot named after the file, and kernels are solved
               on it
@@ -63,7 +64,7 @@ Make a *.map file. In the folder `saved` of a server's store, `potclient map loa
 
 _IMPORT_EXAMPLES = """\
 examples:
-  potserver map import hall.bt -o ~/.local/state/potserver/potserver/saved/hall.map
+  potserver map import hall.bt -o ~/.local/state/potserver/potserver/saved/default/hall.map
   potclient map load hall"""
 
 _MERGE = """\
@@ -92,7 +93,7 @@ _MAX_PLACES = 20_000_000
 
 def add(commands: Any) -> None:
     """Add the verb."""
-    verbs = add_group(commands, "map", "see, export, import and merge kept maps")
+    verbs = add_group(commands, "map", "see, check, upgrade, export, import and merge kept maps")
 
     info = add_verb(verbs, "info", _info, help="what saved maps or a store hold", description=_INFO)
     info.add_argument("path", type=Path, metavar="FILE|DIR")
@@ -123,6 +124,7 @@ def add(commands: Any) -> None:
     merge.add_argument("other", type=Path, metavar="OTHER", help="the one that is taken in")
     pose_flag.add_pose_flag(merge)
 
+    map_care.add(verbs)
     for writes in (import_, merge):
         writes.add_argument(
             "-o",
@@ -159,12 +161,13 @@ def _map_files(path: Path) -> list[Path]:
     Raises:
         MapFileError: there are none.
     """
-    from potserver.storage.map_store import SAVED, TILES
+    from potserver.storage.agreement import TILES
+    from potserver.storage.map_store import SAVED
 
     if not path.is_dir():
         return [path]
     found = [path / TILES] if (path / TILES).exists() else sorted(path.glob(f"*/{TILES}"))
-    found += sorted(path.glob("*.map")) + sorted(path.glob(f"{SAVED}/*.map"))
+    found += sorted(path.glob("*.map")) + sorted(path.glob(f"{SAVED}/**/*.map"))
     if not found:
         raise MapFileError(f"no map in {path}: neither {TILES} nor *.map", reason="missing")
     return found
@@ -178,21 +181,21 @@ def _one_file(path: Path) -> Path:
 
 
 def _described(path: Path) -> dict[str, Any]:
+    from potserver.storage.agreement import JOURNAL, TILES
     from potserver.storage.journal import scans_after
-    from potserver.storage.map_file import FORMAT, describe, read_map
-    from potserver.storage.map_store import JOURNAL, TILES
+    from potserver.storage.map_file import describe, read_map
 
     saved = read_map(path)
     r, table = saved.record, describe(saved)
     lines: dict[str, Any] = {
         "file": str(path),
         "map": r.map_id,
-        "format": FORMAT,
+        "format": saved.version,
         "written": time.strftime("%Y-%m-%d %H:%M:%S UTC", time.gmtime(r.written_ns / 1e9)),
         "by": f"potserver {r.written_by}",
         "scans": r.n_scans,
         "revision": r.revision,
-        "robots": r.robots,
+        "robots": [robot for robot in r.robots if robot],
         "tiles": r.n_tiles,
         "kernels": table.n_kernels,
         "rows": table.n_rows,
@@ -265,14 +268,14 @@ def _from_saved(file: Path) -> tuple[MapState, Origin]:
     if left:
         say(f"{left} scans of the journal are not in it: only a server integrates them")
     state = dataclasses.replace(saved.state(), snapshot=saved.kernel_map())
-    return state, Origin(r.map_id, r.keeps_evidence, r.stamps)
+    return state, Origin(r.map_id, r.keeps_evidence, r.heard)
 
 
 def _read_file(file: Path) -> tuple[SavedMap, int]:
     """The map in a file, and how many scans its journal has beyond it; says where a server writes both."""
+    from potserver.storage.agreement import JOURNAL, TILES
     from potserver.storage.journal import scans_after
     from potserver.storage.map_file import read_map
-    from potserver.storage.map_store import JOURNAL, TILES
 
     saved = read_map(file)
     if file.name != TILES:
@@ -370,6 +373,8 @@ def _service(
 
 
 def _merge(options: argparse.Namespace) -> int:
+    from potserver.domain.order import joined
+    from potserver.domain.tiles import check_reach
     from potserver.storage.map_file import Origin, read_map, write_map
 
     settings = settings_of(options)
@@ -381,13 +386,13 @@ def _merge(options: argparse.Namespace) -> int:
     size_m = ours.record.grid[0] if ours.record.grid else settings.mapping.tile_size_m
     service = _service(dataclasses.replace(settings.mapping, tile_size_m=size_m), settings)
     service.restore(ours.state())
-    say(f"merging {theirs.record.n_scans} scans into {ours.record.n_scans}: some seconds for a street")
     pose = pose_flag.pose_of(*options.pose) if options.pose else np.eye(4)
+    if (moved := theirs.state().tiled) is not None:
+        check_reach(moved, pose, settings.limits.max_coordinate_m)
+    say(f"merging {theirs.record.n_scans} scans into {ours.record.n_scans}: some seconds for a street")
     change = service.merge(theirs.state(), pose)
-    stamps = dict(ours.record.stamps)
-    for robot_id, stamp_ns in theirs.record.stamps.items():
-        stamps[robot_id] = max(stamp_ns, stamps.get(robot_id, 0))
-    origin = Origin(ours.record.map_id, ours.record.keeps_evidence, stamps)
+    heard = joined(ours.record.heard, theirs.record.heard)
+    origin = Origin(ours.record.map_id, ours.record.keeps_evidence, heard)
     n_bytes = write_map(options.out, service.state, origin)
     say(
         f"wrote {options.out}: {len(service.snapshot)} kernels, {len(change.tiles)} tiles changed, {n_bytes} bytes"

@@ -30,7 +30,7 @@ One server a map: it ends with exit code 2 where another one on the network serv
 token of one that has just crashed gets 12 s to vanish.
 Its maps survive restarts and crashes: every accepted cloud is on the disk before its receipt. server_started says
 where they are kept (--store) and how many clouds each holds. One server a store.
-Anyone who reaches the port may write: use Zenoh's access control and TLS.
+Anyone who reaches the port may write: `potserver acl` writes access rules and TLS.
 SIGTERM or Ctrl-C drains it: waiting clouds are mapped, everybody gets an answer, exit code 0. A second one
 ends it at once."""
 
@@ -41,6 +41,7 @@ examples:
   potserver serve --map ground --map first_floor         two maps, each with its own writer
   potserver serve --listen tcp/127.0.0.1:0               any free port; the log says which
   potserver serve --store /var/lib/site/maps             keep the maps there; --in-memory: forget them at the end
+  potserver serve --read-only                            answer from the kept maps, write nothing: for a sick disk
   potserver serve --connect tcp/router:7447 --listen tcp/127.0.0.1:7448
                                                          join a Zenoh router (ROS 2 hosts have one on 7447)
   potserver serve --web 127.0.0.1:8080                   a page with the map; /live, /ready, /metrics (Prometheus)

@@ -15,8 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potserver.domain.map_part import MapPart
+from potserver.domain.order import MAX_ROBOTS
 from potserver.domain.types import Bool, Float32, Float64, KernelSet
-from potserver.errors import SettingsError, ShapeError
+from potserver.errors import MapFullError, OutOfRangeError, SettingsError, ShapeError
 from potserver.numerics.bricks import Part
 from potserver.numerics.evidence import Rows, decay, is_alive, tile_of
 from potserver.numerics.threads import parallel_map
@@ -29,6 +30,8 @@ COARSE_SPACING = 2.5  # of the coarse lattice, in resolutions
 _PART = (
     3  # tiles along an edge of what is put into bricks together: a window of nodes rarely crosses its border
 )
+FREE = ""  # in the list of robots: a number that belongs to nobody
+_ROW_BYTES, _KERNEL_BYTES = 31, 122  # of a row; of a kernel in its tile and ready to be asked
 _VOXELS_OF_PAIR = 5  # two coarse cells are five fine ones: the least length that every lattice divides
 
 
@@ -104,6 +107,11 @@ class Tile(NamedTuple):
         """Nothing was ever seen here, or it is forgotten."""
         return len(self.rows.kind) == 0 and len(self.kernels) == 0
 
+    @property
+    def n_bytes(self) -> int:
+        """About what it takes in memory, with its share of the index."""
+        return _ROW_BYTES * len(self.rows.kind) + _KERNEL_BYTES * len(self.kernels)
+
 
 class TileGrid(NamedTuple):
     """How the map is cut: all lattices of voxels and kernels divide a tile, so none crosses an edge."""
@@ -148,7 +156,7 @@ class TiledMap(NamedTuple):
     grid: TileGrid
     tiles: Mapping[TileIndex, Tile]
     parts: Mapping[TileIndex, MapPart]  # kernels of some tiles together, ready to be asked
-    robots: tuple[str, ...] = ()  # whose the rows are: `Rows.source` numbers them
+    robots: tuple[str, ...] = ()  # whose the rows are: `Rows.source` numbers them; FREE where nobody's are
 
     @staticmethod
     def empty(grid: TileGrid) -> TiledMap:
@@ -156,10 +164,23 @@ class TiledMap(NamedTuple):
         return TiledMap(grid, {}, {})
 
     def with_robot(self, robot_id: str) -> tuple[TiledMap, int]:
-        """The map with a robot in its list, and the robot's number."""
+        """The map with a robot in its list, and the robot's number, which may have been another's that was forgotten.
+
+        Raises:
+            MapFullError: the numbers are used up.
+        """
         if robot_id in self.robots:
             return self, self.robots.index(robot_id)
-        return self._replace(robots=(*self.robots, robot_id)), len(self.robots)
+        number = self.robots.index(FREE) if FREE in self.robots else len(self.robots)
+        if number >= MAX_ROBOTS:
+            raise MapFullError(
+                f"the map has evidence of {MAX_ROBOTS} robots and no number for {robot_id}: forget one"
+            )
+        return self._replace(robots=(*self.robots[:number], robot_id, *self.robots[number + 1 :])), number
+
+    def without_robot(self, number: int) -> TiledMap:
+        """The map with a robot's number free for another; none of its rows may be left."""
+        return self._replace(robots=(*self.robots[:number], FREE, *self.robots[number + 1 :]))
 
     def with_tiles(self, changed: Mapping[TileIndex, Tile], *, threads: int = 1) -> TiledMap:
         """The map with some tiles exchanged, or gone if they are empty; only the parts that they lie in are made anew."""
@@ -182,6 +203,45 @@ class TiledMap(NamedTuple):
             else:
                 parts[number] = part
         return self._replace(tiles=tiles, parts=parts)
+
+
+class MapSize:
+    """The bytes of a map that changes tile by tile: only tiles that are not those of before are counted anew."""
+
+    def __init__(self) -> None:
+        self._tiles: Mapping[TileIndex, Tile] = {}
+        self._n_bytes = 0
+
+    def of(self, tiled: TiledMap | None) -> int:
+        """About how many bytes it takes in memory."""
+        before, after = self._tiles, {} if tiled is None else tiled.tiles
+        if before is not after:
+            for index in before.keys() | after.keys():
+                old, new = before.get(index), after.get(index)
+                if old is not new:
+                    self._n_bytes += (new.n_bytes if new else 0) - (old.n_bytes if old else 0)
+            self._tiles = after
+        return self._n_bytes
+
+
+def check_reach(tiled: TiledMap, T_map_tiled: Float64, max_coordinate_m: float) -> None:
+    """Refuse to move a map to where no map may be.
+
+    Args:
+        tiled: The map.
+        T_map_tiled: (4, 4) rigid, what it is moved by.
+        max_coordinate_m: m, of anything in the map frame.
+    Raises:
+        OutOfRangeError: a tile would reach beyond that.
+    """
+    if not tiled.tiles:
+        return
+    index = np.array(list(tiled.tiles), np.float64)
+    bounds = np.stack([index.min(axis=0), index.max(axis=0) + 1.0]) * tiled.grid.size_m
+    corners = np.array(list(itertools.product(*bounds.T)))
+    reach_m = float(np.abs(corners @ T_map_tiled[:3, :3].T + T_map_tiled[:3, 3]).max())
+    if reach_m > max_coordinate_m:
+        raise OutOfRangeError(f"the moved map reaches {reach_m:.6g} m, the limit is {max_coordinate_m:.6g} m")
 
 
 def part_of(index: TileIndex) -> TileIndex:

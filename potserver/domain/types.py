@@ -34,6 +34,7 @@ class Scan:
     is_return: Bool = None  # type: ignore[assignment]  # (N,) false = no echo, the beam was free up to the point; all by default
     is_planar: bool = False  # a 2D scanner: everything has z = 0
     robot_id: str = "robot"
+    session: str = ""  # the run of the robot's program that counts `seq`
     seq: int = 0
     stamp_ns: int = 0
 
@@ -267,6 +268,18 @@ class Occupancy:
     map_revision: int = 0
     gradient: Float64 | None = None  # (N, 3) 1/m, of `mean`; 0 where unobserved; none unless asked for
     latent_gradient: Float64 | None = None  # (N, 3) log-odds/m, of `latent_mean`; likewise
+
+    @staticmethod
+    def concatenate(parts: list[Occupancy]) -> Occupancy:
+        """Answers of one map at the points of all parts, in order; at least one part."""
+        if len(parts) == 1:
+            return parts[0]
+        columns: dict[str, Any] = {
+            field.name: np.concatenate([getattr(part, field.name) for part in parts])
+            for field in dataclasses.fields(Occupancy)
+            if isinstance(getattr(parts[0], field.name), np.ndarray)
+        }
+        return Occupancy(map_revision=parts[0].map_revision, **columns)
 
 
 class Unknown(str, Enum):

@@ -7,7 +7,16 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from potserver.domain.tiles import CARRIED, MapKernels, Region, TiledMap, TileIndex, part_of, tiles_of_part
+from potserver.domain.tiles import (
+    CARRIED,
+    FREE,
+    MapKernels,
+    Region,
+    TiledMap,
+    TileIndex,
+    part_of,
+    tiles_of_part,
+)
 from potserver.domain.types import Float64, check_rigid
 from potserver.errors import UnknownRobotError, UnsupportedError
 from potserver.mapping.fusion import (
@@ -54,9 +63,10 @@ def merge(
     check_rigid(T_ours_theirs)
     R, t = T_ours_theirs[:3, :3], T_ours_theirs[:3, 3]
     numbers = []
-    for robot_id in theirs.robots:
-        ours, number = ours.with_robot(robot_id)
-        numbers.append(number)
+    for source, robot_id in enumerate(theirs.robots):
+        if robot_id != FREE:
+            ours, number = ours.with_robot(robot_id)
+            numbers.append((source, number))
     size, pad = theirs.grid.size_m, ours.grid.coarse_m
     touched: set[TileIndex] = set()
     for part in dict.fromkeys(part_of(index) for index in theirs.tiles):
@@ -101,7 +111,7 @@ def merge(
                     ),
                     number,
                 )
-                for source, number in enumerate(numbers)
+                for source, number in numbers
             ]
         )
         planar = len(where) > 0 and float(np.ptp(where[:, 2])) < 1e-4 * theirs.grid.fine_m
@@ -117,7 +127,7 @@ def remove_robot(
 ) -> tuple[TiledMap, set[TileIndex]]:
     """The map without what one robot has seen, and the tiles that changed; places that nobody else saw are unknown again.
 
-    What the robot's scans made fade of others' hits does not come back.
+    What the robot's scans made fade of others' hits does not come back. The robot's number is free for another.
 
     Raises:
         UnknownRobotError: the map has nothing from this robot.
@@ -125,7 +135,7 @@ def remove_robot(
         SolverError: a solve ended without numbers.
     """
     if robot_id not in tiled.robots:
-        known = ", ".join(tiled.robots) or "nobody"
+        known = ", ".join(filter(None, tiled.robots)) or "nobody"
         raise UnknownRobotError(f"the map has nothing from {robot_id!r}; it has scans from {known}")
     source = tiled.robots.index(robot_id)
     without = {
@@ -143,7 +153,7 @@ def remove_robot(
         for dy in (-1, 0, 1)
         for dz in (-1, 0, 1)
     }
-    left = tiled._replace(tiles={**tiled.tiles, **without})
+    left = tiled.without_robot(source)._replace(tiles={**tiled.tiles, **without})
     return _settle(left, around & left.tiles.keys(), options, moment, threads)
 
 

@@ -9,23 +9,32 @@ from __future__ import annotations
 import contextlib
 import secrets
 import sqlite3
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import msgspec
 
 from potserver.errors import MapFileError, StorageError
 from potserver.storage.seal import sealed, unsealed
-from potserver.storage.sqlite import Kind, connect, connect_read_only, reading, transaction
+from potserver.storage.sqlite import (
+    Kind,
+    close_keeping_log,
+    connect,
+    connect_read_only,
+    reading,
+    settle,
+    transaction,
+)
 
-FORMAT = 1
-_KIND = Kind(
+FORMAT = 2
+KIND = Kind(
     application_id=0x706F746A,  # "potj"
     version=FORMAT,
     schema=(
         "CREATE TABLE scans (number INTEGER PRIMARY KEY, data BLOB NOT NULL)",
         "CREATE TABLE head (id INTEGER PRIMARY KEY CHECK (id = 0), content BLOB NOT NULL)",
     ),
+    readable=(1,),
 )
 
 
@@ -39,14 +48,16 @@ class _Head(msgspec.Struct, frozen=True, kw_only=True):
 class Journal:
     """An open journal, which nobody else can open. One caller at a time."""
 
-    def __init__(self, path: Path, *, fsync: bool = True) -> None:
-        """Open or make it.
+    def __init__(self, path: Path, *, fsync: bool = True, must_exist: bool = False) -> None:
+        """Open or make it; nothing is written before `begin`.
 
+        Args:
+            path, fsync, must_exist: See `sqlite.connect`.
         Raises:
             MapFileError: damaged, or of another version. StorageError: another server has it, or the disk refuses.
         """
         self._path = path
-        self._connection = connect(path, _KIND, fsync=fsync, exclusive=True)
+        self._connection = connect(path, KIND, fsync=fsync, exclusive=True, must_exist=must_exist)
         try:
             with reading(path):
                 found = self._connection.execute("SELECT content FROM head").fetchall()
@@ -58,11 +69,26 @@ class Journal:
                 head = _Head(store_id=secrets.token_hex(8), last=0, pruned=0, closed=True)
             self.was_closed = head.closed
             self._head = head
-            with transaction(self._connection, path):
-                self._head = self._put_head(closed=False)
         except BaseException:
-            self._connection.close()
+            close_keeping_log(self._connection, path)
             raise
+
+    def begin(self, number: int) -> None:
+        """Go on from here: the mark that all is complete goes, and the next scan gets a higher number than any before.
+
+        Args:
+            number: The largest that was ever given, if the journal does not know it; a snapshot has everything up to it.
+        Raises:
+            StorageError: the disk refuses.
+        """
+        with transaction(self._connection, self._path):
+            if number > self.last:
+                self._prune(number)
+                head = self._put_head(last=number, pruned=number, closed=False)
+            else:
+                head = self._put_head(closed=False)
+        self._head = head
+        settle(self._connection, self._path)  # whose journal it is must not hang on the log
 
     @property
     def store_id(self) -> str:
@@ -79,17 +105,19 @@ class Journal:
         """Scans up to this number may be gone."""
         return self._head.pruned
 
-    def append(self, cloud: bytes, *, prune_to: int) -> None:
+    def append(self, cloud: bytes, *, prune_to: int, check: Callable[[], None] = lambda: None) -> None:
         """Keep one more scan; it is on the disk when this returns.
 
         Args:
             cloud: The scan as `pot.cloud.v1`, with pose and robot.
             prune_to: Number of the last scan that is in a snapshot: it and those before it are deleted.
+            check: Called before anything is written; if it raises, nothing is.
         Raises:
             StorageError: the disk refuses; the journal is as it was.
         """
         number = self._head.last + 1
         with transaction(self._connection, self._path):
+            check()
             self._connection.execute(
                 "INSERT INTO scans VALUES (?, ?)", (number, sealed(cloud, place=_place(number)))
             )
@@ -132,6 +160,10 @@ class Journal:
             with contextlib.suppress(sqlite3.Error):
                 self._connection.close()
 
+    def leave(self) -> None:
+        """Close it as it was found."""
+        close_keeping_log(self._connection, self._path)
+
     def _has_scans(self) -> bool:
         with reading(self._path):
             return self._connection.execute("SELECT 1 FROM scans LIMIT 1").fetchone() is not None
@@ -162,6 +194,17 @@ class Journal:
         )
 
 
+def is_in_use(path: Path) -> bool:
+    """Whether a server has a journal open."""
+    try:
+        with contextlib.closing(connect_read_only(path, KIND, busy_s=0.0)):
+            return False
+    except StorageError as error:
+        return error.reason == "in_use"
+    except MapFileError:  # whoever opens it will say what is wrong
+        return False
+
+
 def scans_after(path: Path, number: int) -> int | None:
     """How many scans with higher numbers a journal has, or None where a server has it open; it is not changed.
 
@@ -169,7 +212,7 @@ def scans_after(path: Path, number: int) -> int | None:
         MapFileError: it is missing or damaged. StorageError: it cannot be opened.
     """
     try:
-        with contextlib.closing(connect_read_only(path, _KIND, busy_s=0.0)) as connection, reading(path):
+        with contextlib.closing(connect_read_only(path, KIND, busy_s=0.0)) as connection, reading(path):
             row = connection.execute("SELECT COUNT(*) FROM scans WHERE number > ?", (number,)).fetchone()
     except StorageError as error:
         if error.reason == "in_use":

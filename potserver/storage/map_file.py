@@ -24,22 +24,33 @@ from potschemas.answers import AnswerRule
 from potserver.domain.folders import sync_folder
 from potserver.domain.kernel_map import KernelMap
 from potserver.domain.map_state import MapState
+from potserver.domain.order import Heard
 from potserver.domain.running_scores import RunningScores
 from potserver.domain.tiles import Tile, TiledMap, TileGrid, TileIndex
 from potserver.domain.types import KernelSet
-from potserver.errors import MapFileError, StorageError
+from potserver.errors import MapFileError
+from potserver.storage.files import disk_faults, make_private_folder
 from potserver.storage.seal import SEAL_BYTES, seal_number, sealed, unsealed
-from potserver.storage.sqlite import Kind, after_damage, connect, connect_read_only, reading, transaction
+from potserver.storage.sqlite import (
+    Kind,
+    after_damage,
+    close_keeping_log,
+    connect,
+    connect_read_only,
+    reading,
+    transaction,
+)
 from potserver.storage.tile_codec import decode_tile, encode_tile
 
-FORMAT = 1
-_KIND = Kind(
+FORMAT = 2
+KIND = Kind(
     application_id=0x706F746D,  # "potm"
     version=FORMAT,
     schema=(
         "CREATE TABLE tiles (x INTEGER, y INTEGER, z INTEGER, data BLOB NOT NULL, UNIQUE (x, y, z))",
         "CREATE TABLE map (id INTEGER PRIMARY KEY CHECK (id = 0), record BLOB NOT NULL)",
     ),
+    readable=(1,),
 )
 _SUM_LIMIT = 1 << 8 * SEAL_BYTES
 
@@ -50,6 +61,7 @@ class MapRecord(msgspec.Struct, frozen=True, kw_only=True):
     map_id: str
     store_id: str  # of the store whose journal goes on from here; empty in a file of its own
     number: int  # of the journal's last scan that is in it
+    edition: int = 0  # counts the snapshots of a store
     written_ns: int
     written_by: str  # version of potserver
     epoch: int
@@ -58,7 +70,7 @@ class MapRecord(msgspec.Struct, frozen=True, kw_only=True):
     stamp_ns: int
     grid: tuple[float, float] | None  # size_m and fine_m; none: no scan yet
     robots: list[str]
-    stamps: dict[str, int]  # newest accepted stamp of each robot, ns
+    heard: dict[str, dict[str, int]] = {}  # see `CloudOrder`
     keeps_evidence: bool  # false: profile `paper`, kernels without rows
     rule: tuple[float, float, float, float]  # with which it answered
     scores_n: float
@@ -83,6 +95,7 @@ class SavedMap(NamedTuple):
     record: MapRecord
     tiled: TiledMap | None
     n_bytes: int  # of the tiles as they are kept
+    version: int  # of the file's format
 
     def kernel_map(self) -> KernelMap:
         """The map that answers as the saved one did."""
@@ -117,22 +130,25 @@ class Origin(NamedTuple):
 
     map_id: str
     keeps_evidence: bool
-    stamps: Mapping[str, int]  # newest accepted stamp of each robot, ns
+    heard: Heard
     store_id: str = ""
     number: int = 0
+    edition: int = 0
 
 
 class MapFile:
     """A map file that is open for writing. One caller at a time."""
 
-    def __init__(self, path: Path, *, fsync: bool = True, wal: bool = True) -> None:
+    def __init__(self, path: Path, *, fsync: bool = True, wal: bool = True, must_exist: bool = False) -> None:
         """Open or make it.
 
+        Args:
+            path, fsync, wal, must_exist: See `sqlite.connect`.
         Raises:
             MapFileError, StorageError: see `sqlite.connect`.
         """
         self.path = path
-        self._connection = connect(path, _KIND, fsync=fsync, wal=wal)
+        self._connection = connect(path, KIND, fsync=fsync, wal=wal, must_exist=must_exist)
         self._written: dict[TileIndex, tuple[int, int]] = {}  # revision and digest of each tile
         self._epoch: int | None = None  # which those revisions are of
 
@@ -185,6 +201,10 @@ class MapFile:
         with contextlib.suppress(sqlite3.Error):
             self._connection.close()
 
+    def leave(self) -> None:
+        """Close it as it was found."""
+        close_keeping_log(self._connection, self.path)
+
     def __enter__(self) -> MapFile:
         return self
 
@@ -204,15 +224,14 @@ def write_map(path: Path, state: MapState, origin: Origin) -> int:
     """
     partial = path.with_name(path.name + ".partial")
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        partial.unlink(missing_ok=True)
-        with MapFile(partial, wal=False) as file:
-            file.write(state, origin)
-        n_bytes = partial.stat().st_size
-        partial.replace(path)
-        sync_folder(path.parent)
-    except OSError as error:
-        raise StorageError(f"cannot write {path}: {error.strerror or error}") from error
+        with disk_faults("write", path):
+            make_private_folder(path.parent)
+            partial.unlink(missing_ok=True)
+            with MapFile(partial, wal=False) as file:
+                file.write(state, origin)
+            n_bytes = partial.stat().st_size
+            partial.replace(path)
+            sync_folder(path.parent)
     finally:
         with contextlib.suppress(OSError):
             partial.unlink(missing_ok=True)
@@ -227,7 +246,7 @@ def read_map(path: Path) -> SavedMap:
     Raises:
         MapFileError: there is no such file, or it is damaged, of another version, or holds no map yet.
     """
-    with contextlib.closing(connect_read_only(path, _KIND)) as connection:
+    with contextlib.closing(connect_read_only(path, KIND)) as connection:
         saved = _read(connection, path, {})
     if saved is None:
         raise MapFileError(
@@ -261,6 +280,7 @@ def _record_of(state: MapState, origin: Origin, tiles: Mapping[TileIndex, tuple[
         map_id=origin.map_id,
         store_id=origin.store_id,
         number=origin.number,
+        edition=origin.edition,
         written_ns=time.time_ns(),
         written_by=__version__,
         epoch=state.epoch,
@@ -269,7 +289,7 @@ def _record_of(state: MapState, origin: Origin, tiles: Mapping[TileIndex, tuple[
         stamp_ns=state.stamp_ns,
         grid=None if tiled is None else (tiled.grid.size_m, tiled.grid.fine_m),
         robots=[] if tiled is None else list(tiled.robots),
-        stamps=dict(origin.stamps),
+        heard={robot: dict(sessions) for robot, sessions in origin.heard.items()},
         keeps_evidence=origin.keeps_evidence,
         rule=dataclasses.astuple(rule),
         scores_n=scores.n_points,
@@ -298,6 +318,7 @@ def _read(
         if len(found) != 1:
             raise _damaged(path, "its record is missing")
         record = _parse(path, found[0][0])
+        version = int(connection.execute("PRAGMA user_version").fetchone()[0])
         grid = TileGrid(*record.grid) if record.grid is not None else None
         for *named, data in connection.execute("SELECT x, y, z, data FROM tiles ORDER BY rowid"):
             if grid is None or not isinstance(data, bytes):
@@ -314,9 +335,9 @@ def _read(
     if len(tiles) != record.n_tiles or f"{_sum(d for _, d in written.values()):x}" != record.tiles_digest:
         raise _damaged(path, f"it has {len(tiles)} tiles, and not the {record.n_tiles} that were written")
     if grid is None:
-        return SavedMap(record, None, 0)
+        return SavedMap(record, None, 0, version)
     tiled = TiledMap.empty(grid)._replace(robots=tuple(record.robots)).with_tiles(tiles)
-    return SavedMap(record, tiled, n_bytes)
+    return SavedMap(record, tiled, n_bytes, version)
 
 
 def _parse(path: Path, data: object) -> MapRecord:

@@ -3,7 +3,8 @@
 A scan is in the journal, on the disk, before it is in the map and before anybody is told so. A thread of its own writes
 snapshots, from states that never change. What a snapshot has, the journal forgets with its next scan. At the start the last
 snapshot is read, and the journal's scans after it are integrated again. There are two files so that a long snapshot never holds
-up a scan. Each knows what the other must have: a file that is lost or old is noticed.
+up a scan. Each knows what the other must have, and a mark beside them how far both have come: a file that is lost, old or
+cut off is noticed (`agreement`). Nothing is acknowledged that went into files which no longer bear their names.
 """
 
 from __future__ import annotations
@@ -11,12 +12,14 @@ from __future__ import annotations
 import secrets
 import threading
 import time
-from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
 
+import msgspec
+
 from potserver.codec.clouds import encode_cloud, read_cloud
 from potserver.domain.map_state import MapState
+from potserver.domain.order import CloudOrder, Heard
 from potserver.domain.types import Scan
 from potserver.errors import (
     MapFileError,
@@ -29,13 +32,24 @@ from potserver.errors import (
 from potserver.health import Health
 from potserver.log import get_logger
 from potserver.mapping.service import MappingService
+from potserver.storage.agreement import (
+    JOURNAL,
+    MARK,
+    TILES,
+    Standing,
+    check_agreement,
+    check_complete,
+)
+from potserver.storage.files import NamedFiles, make_private_folder
 from potserver.storage.journal import Journal
 from potserver.storage.map_file import MapFile, Origin, SavedMap, read_map, write_map
+from potserver.storage.mark import Mark, Progress, read_mark
+from potserver.storage.sqlite import log_of
 from potserver.threads import spawn
 
 log = get_logger("potserver.store")
 
-JOURNAL, TILES, SAVED = "journal.sqlite", "tiles.sqlite", "saved"
+SAVED = "saved"
 SNAPSHOT_SCANS = 50  # a restart integrates at most so many again: seconds
 SNAPSHOT_BYTES = 64 * 2**20  # large scans make a snapshot due earlier
 MAX_SAVED = 100  # copies with a name: whoever reaches the server may ask for one more
@@ -48,14 +62,14 @@ class Restored(NamedTuple):
 
     n_scans: int  # in the map now
     n_replayed: int  # of those, from the journal
-    stamps: dict[str, int]  # newest accepted stamp of each robot, ns
+    heard: Heard  # the robots' last numbers
 
 
 class _Newest(NamedTuple):
     """A state of the map, and where in the journal it stands."""
 
     state: MapState
-    stamps: Mapping[str, int]
+    heard: Heard
     number: int
 
 
@@ -86,29 +100,28 @@ class MapStore:
             fsync: Wait for the disk with each scan. Without, a crash of the machine may take the last ones; a crash of the
                 process does not.
             snapshot_scans, snapshot_bytes: A snapshot is written after so many scans, or so many bytes of the journal.
-            max_saved: Copies with a name that may lie in the folder `saved` of all maps.
+            max_saved: Copies with a name that may lie in `<folder>/saved/<map_id>`.
         Raises:
             StorageError: another server has the folder, or the disk refuses.
             MapFileError: a file in it is damaged, or of another version.
         """
         self.folder = folder / map_id
-        self._saved = folder / SAVED
+        self._saved = folder / SAVED / map_id
         self._map_id, self._keeps_evidence, self._health = map_id, keeps_evidence, health
         self._snapshot_scans, self._snapshot_bytes = snapshot_scans, snapshot_bytes
-        self._max_saved = max_saved
+        self._max_saved, self._fsync = max_saved, fsync
+        make_private_folder(folder)
+        make_private_folder(self.folder)
+        has_begun = check_complete(self.folder)
+        self._journal = Journal(self.folder / JOURNAL, fsync=fsync, must_exist=has_begun)
         try:
-            self.folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise StorageError(
-                f"cannot make the map's folder {self.folder}: {error.strerror or error}; name another one (--store), or"
-                " keep the map in memory (--in-memory)"
-            ) from error
-        self._journal = Journal(self.folder / JOURNAL, fsync=fsync)
-        try:
-            self._tiles = MapFile(self.folder / TILES, fsync=fsync)
+            self._tiles = MapFile(self.folder / TILES, fsync=fsync, must_exist=has_begun)
         except BaseException:
-            self._journal.close()
+            self._journal.leave()
             raise
+        self._mark: Mark | None = None  # from `restore` on
+        self._files: NamedFiles | None = None
+        self._edition = 0  # of the newest snapshot
         self._number = self._journal.last
         self._taken = 0  # number of the last scan that is in a snapshot
         self._unsaved_bytes = 0  # of the journal, since the last snapshot that was asked for
@@ -130,10 +143,11 @@ class MapStore:
         """
         started_s = time.perf_counter()
         saved = self._tiles.read()
-        self._check_whole(saved)
-        stamps: dict[str, int] = {}
+        mark = read_mark(self.folder / MARK)
+        standing = check_agreement(self.folder, self._journal, None if saved is None else saved.record, mark)
+        order = CloudOrder()
         if saved is not None:
-            stamps.update(saved.record.stamps)
+            order.replace(saved.record.heard)
             self._taken = saved.record.number
             # a scan that is integrated again may give other last digits: the epoch tells readers that the revision is another
             keeps_epoch = self._journal.was_closed and self._journal.last == self._taken
@@ -142,10 +156,8 @@ class MapStore:
             mapper.restore(saved.state(epoch=epoch))
             if keeps_epoch:
                 self._written = mapper.state
-        n_replayed = self._replay(mapper, stamps)
-        self._number = max(self._journal.last, self._taken)
-        self._asked = self._taken
-        self._newest = _Newest(mapper.state, dict(stamps), self._number)
+        n_replayed = self._replay(mapper, order)
+        self._begin(mapper.state, order.heard, standing, mark)
         log.info(
             "map_restored",
             map_id=self._map_id,
@@ -155,28 +167,27 @@ class MapStore:
             map_revision=mapper.state.map_revision,
             elapsed_ms=round((time.perf_counter() - started_s) * 1e3, 1),
         )
-        return Restored(mapper.n_scans, n_replayed, stamps)
+        return Restored(mapper.n_scans, n_replayed, order.heard)
 
-    def _check_whole(self, saved: SavedMap | None) -> None:
-        """The two files must be of one store, and meet."""
-        number, store_id = (0, "") if saved is None else (saved.record.number, saved.record.store_id)
-        way_out = (
-            f"move {self.folder} away, start with an empty map, and load a saved copy (`potclient map load NAME`);"
-            f" `potserver map import {self.folder} -o NAME.map` makes one of the last snapshot"
+    def _begin(self, state: MapState, heard: Heard, standing: Standing, mark: Progress | None) -> None:
+        """From now on scans and snapshots are written."""
+        self._number, self._edition = standing.number, standing.edition
+        if standing.lacks:
+            log.warning("store_short", map_id=self._map_id, folder=str(self.folder), lacks=standing.lacks)
+            # before the journal goes on from a number that it has not reached
+            self._write(_Newest(state, heard, self._number))
+        self._journal.begin(self._number)
+        progress = mark or Progress(store_id=self._journal.store_id)
+        self._mark = Mark(
+            self.folder / MARK,
+            msgspec.structs.replace(progress, last=self._number, edition=self._edition, synced=self._fsync),
         )
-        if store_id not in ("", self._journal.store_id):
-            raise MapFileError(
-                f"{self.folder}: {JOURNAL} is missing or of another map than {TILES}; {way_out}",
-                reason="damaged",
-            )
-        if number < self._journal.pruned:
-            raise MapFileError(
-                f"{self.folder}: {TILES} is missing or too old: it has the scans up to {number}, and {JOURNAL} only those"
-                f" after {self._journal.pruned}; {way_out}",
-                reason="damaged",
-            )
+        files = [self.folder / name for name in (JOURNAL, TILES)]
+        self._files = NamedFiles([self._mark.path, *files, *map(log_of, files)])
+        self._asked = self._taken
+        self._newest = _Newest(state, heard, self._number)
 
-    def _replay(self, mapper: MappingService, stamps: dict[str, int]) -> int:
+    def _replay(self, mapper: MappingService, order: CloudOrder) -> int:
         n = self._journal.last - self._taken
         if n > 0:
             log.info("journal_replaying", map_id=self._map_id, n_scans=n)
@@ -193,12 +204,15 @@ class MapStore:
                     reason="settings",
                 ) from error
             self._unsaved_bytes += len(payload)
-            stamps[scan.robot_id] = max(scan.stamp_ns, stamps.get(scan.robot_id, 0))
+            order.remember(scan.robot_id, scan.session, scan.seq)
             done += 1
             if time.monotonic() - reported_s > _REPORT_S:
                 reported_s = time.monotonic()
                 log.info("journal_replaying", map_id=self._map_id, n_scans=n, n_done=done)
         return done
+
+    def check_takes(self) -> None:
+        """All scans are welcome."""
 
     # --- scans ----------------------------------------------------------------------------------------------
 
@@ -211,24 +225,26 @@ class MapStore:
         started_s = time.perf_counter()
         payload = encode_cloud(scan)
         try:
-            self._journal.append(payload, prune_to=self._taken)
+            self._journal.append(payload, prune_to=self._taken, check=self._check_files)
+            self._check_files()
         except StorageError:
             self._health.count("store.appends_failed")
             raise
         self._number = self._journal.last
+        self._advance_mark(last=self._number)
         self._unsaved_bytes += len(payload)
         self._health.count("store.appends")
         self._health.observe("journal", (time.perf_counter() - started_s) * 1e3)
 
-    def advance(self, mapper: MappingService, stamps: Mapping[str, int]) -> None:
+    def advance(self, mapper: MappingService, heard: Heard) -> None:
         """The last scan is in the map; a snapshot is begun if enough have come. Never waits.
 
         Args:
             mapper: With it.
-            stamps: Newest accepted stamp of each robot, ns.
+            heard: The robots' last numbers, with it.
         """
         with self._changed:
-            self._newest = _Newest(mapper.state, dict(stamps), self._number)
+            self._newest = _Newest(mapper.state, heard, self._number)
             due = self._number - self._asked >= self._snapshot_scans
             if due or self._unsaved_bytes >= self._snapshot_bytes:
                 self._asked, self._unsaved_bytes = self._number, 0
@@ -237,27 +253,27 @@ class MapStore:
 
     # --- maps -----------------------------------------------------------------------------------------------
 
-    def replace(self, state: MapState, stamps: Mapping[str, int]) -> None:
+    def replace(self, state: MapState, heard: Heard) -> None:
         """Write a snapshot of a state that is about to become the map; it is on the disk when this returns.
 
         Raises:
             StorageError: the disk refuses; what was kept before still is, and the state must not become the map.
         """
         with self._writing:
-            newest = _Newest(state, dict(stamps), self._number)
+            newest = _Newest(state, heard, self._number)
             self._write(newest)
             with self._changed:
                 self._newest = newest
                 self._asked, self._unsaved_bytes = self._number, 0
 
-    def save(self, name: str | None, mapper: MappingService, stamps: Mapping[str, int]) -> str:
+    def save(self, name: str | None, mapper: MappingService, heard: Heard) -> str:
         """Write a snapshot now, and a file of its own if there is a name; what was done, for people.
 
         Raises:
             StorageError: the disk refuses. TooLargeError: there are as many files as may be.
         """
         state = mapper.state
-        self.replace(state, stamps)
+        self.replace(state, heard)
         if name is None:
             return f"the snapshot holds all {state.n_scans} scans"
         path = self._saved / f"{name}.map"
@@ -266,12 +282,12 @@ class MapStore:
             raise TooLargeError(
                 f"{len(others)} maps are saved already, the limit is {self._max_saved}: move some out of {self._saved}"
             )
-        n_bytes = write_map(path, state, Origin(self._map_id, self._keeps_evidence, stamps))
+        n_bytes = write_map(path, state, Origin(self._map_id, self._keeps_evidence, heard))
         self._health.count("store.saved")
         return f"{state.n_scans} scans saved as {path}, {n_bytes} bytes"
 
-    def load(self, name: str, mapper: MappingService) -> tuple[MapState, dict[str, int]]:
-        """Read a saved map: the state to replace the present one with, of a new epoch and a higher revision, and its stamps.
+    def load(self, name: str, mapper: MappingService) -> tuple[MapState, Heard]:
+        """Read a saved map: the state to replace the present one with, of a new epoch and a higher revision, and its numbers.
 
         Raises:
             UnknownMapError: none was saved under that name.
@@ -280,20 +296,34 @@ class MapStore:
         path = self._saved / f"{name}.map"
         if not path.is_file():
             names = ", ".join(sorted(p.stem for p in self._saved.glob("*.map"))) or "none"
-            raise UnknownMapError(f"no map was saved as {name!r}; there are: {names}")
+            common = self._saved.parent / path.name
+            hint = (
+                f"; {common} is where all maps had their copies: move it to {path}"
+                if common.is_file()
+                else ""
+            )
+            raise UnknownMapError(f"no map was saved as {name!r}; there are: {names}{hint}")
         saved = read_map(path)
         self._check_fits(mapper, saved, path)
         revision = max(mapper.state.map_revision, saved.record.revision) + 1
-        return saved.state(epoch=secrets.randbits(62), revision=revision), dict(saved.record.stamps)
+        return saved.state(epoch=secrets.randbits(62), revision=revision), saved.record.heard
 
     # --- end ------------------------------------------------------------------------------------------------
 
+    def drop(self) -> None:
+        """Close without a last snapshot; what was never restored stays as it was found."""
+        self._end_snapshots()
+        self._tiles.leave()
+        self._journal.leave()
+        if self._mark is not None:
+            self._mark.close()
+
     def close(self) -> bool:
         """Write a last snapshot if the map has changed since the one before, and close; false if the disk refused."""
-        with self._changed:
-            self._closed = True
-            self._changed.notify_all()
-        self._thread.join()
+        if self._mark is None:
+            self.drop()
+            return True
+        self._end_snapshots()
         complete_to = None
         try:
             newest = self._newest
@@ -311,6 +341,27 @@ class MapStore:
         finally:
             self._tiles.close()
             self._journal.close()
+            self._mark.close()
+
+    def _check_files(self) -> None:
+        """Raises StorageError where what is written now is not what stands on the disk under the store's names."""
+        if self._files is not None:
+            self._files.check()
+
+    def _advance_mark(self, **numbers: int) -> None:
+        if self._mark is None:
+            return
+        try:
+            self._mark.advance(**numbers)
+        except StorageError as error:  # what was written is safe; only its loss might go unnoticed
+            self._health.count("store.marks_failed")
+            log.warning("mark_failed", map_id=self._map_id, detail=str(error))
+
+    def _end_snapshots(self) -> None:
+        with self._changed:
+            self._closed = True
+            self._changed.notify_all()
+        self._thread.join()
 
     def _run(self) -> None:
         """Write the snapshots that `advance` asks for."""
@@ -336,9 +387,18 @@ class MapStore:
     def _write(self, newest: _Newest) -> None:
         started_s = time.perf_counter()
         origin = Origin(
-            self._map_id, self._keeps_evidence, newest.stamps, self._journal.store_id, newest.number
+            self._map_id,
+            self._keeps_evidence,
+            newest.heard,
+            self._journal.store_id,
+            newest.number,
+            self._edition + 1,
         )
+        self._check_files()
         n_bytes = self._tiles.write(newest.state, origin)
+        self._check_files()
+        self._edition += 1
+        self._advance_mark(edition=self._edition)
         self._taken, self._written = newest.number, newest.state
         elapsed_ms = (time.perf_counter() - started_s) * 1e3
         self._health.count("store.snapshots")
@@ -373,16 +433,19 @@ class MemoryOnly:
 
     durable = False
 
+    def check_takes(self) -> None:
+        """All scans are welcome."""
+
     def append(self, scan: Scan) -> None:
         """Nothing to do."""
 
-    def advance(self, mapper: MappingService, stamps: Mapping[str, int]) -> None:
+    def advance(self, mapper: MappingService, heard: Heard) -> None:
         """Nothing to do."""
 
-    def replace(self, state: MapState, stamps: Mapping[str, int]) -> None:
+    def replace(self, state: MapState, heard: Heard) -> None:
         """Nothing to do."""
 
-    def save(self, name: str | None, mapper: MappingService, stamps: Mapping[str, int]) -> str:
+    def save(self, name: str | None, mapper: MappingService, heard: Heard) -> str:
         """Not here.
 
         Raises:
@@ -390,7 +453,7 @@ class MemoryOnly:
         """
         raise UnsupportedError(_IN_MEMORY)
 
-    def load(self, name: str, mapper: MappingService) -> tuple[MapState, dict[str, int]]:
+    def load(self, name: str, mapper: MappingService) -> tuple[MapState, Heard]:
         """Not here.
 
         Raises:

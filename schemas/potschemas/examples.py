@@ -118,6 +118,20 @@ def examples() -> dict[str, m.Message]:
         ),
         "rejected",
     )
+    add(m.Cloud(seq=8, stamp_ns=_STAMP_NS, points=points, robot="r1", session="5f0c9a1e22b4d7c3"), "session")
+    add(
+        m.Receipt(
+            map="default",
+            robot="r1",
+            seq=8,
+            status=m.ReceiptStatus.REJECTED,
+            reason=m.ErrorCode.OLD_SEQ.value,
+            message="cloud 8 of r1 is not above 12",
+            map_revision=31,
+            next_seq=13,
+        ),
+        "old_seq",
+    )
     params = m.Params(
         map="default",
         robot="r1",

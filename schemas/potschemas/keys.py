@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 DEFAULT_ROOT = "pot/v1"
 CONTROL_VERBS = ("save", "load", "clear", "drain", "merge", "forget")
+CHANGE_ATOMS = "atoms"  # `ctl/atoms`: not a verb of a map, but of the server's one dictionary
 RESERVED_MAP_IDS = ("srv",)  # `<root>/srv/...` belongs to the servers
 _ID = re.compile(r"[a-z0-9][a-z0-9_.-]{0,62}\Z")
 _ROOT_CHUNK = re.compile(r"[^/*$#?@\s][^/*$#?\s]*\Z")
@@ -64,6 +65,10 @@ class MapKeys(NamedTuple):
         """PUT, robot to server: the optional pose stream."""
         return f"{self.root}/{self.map_id}/in/{robot}/pose"
 
+    def integrate(self, robot: str) -> str:
+        """QUERY, robot to server: one scan, whose receipt is the answer."""
+        return f"{self.root}/{self.map_id}/in/{robot}/integrate"
+
     def receipt(self, robot: str) -> str:
         """PUT, server to robot: what became of each cloud."""
         return f"{self.root}/{self.map_id}/out/{robot}/receipt"
@@ -78,11 +83,11 @@ class MapKeys(NamedTuple):
         return f"{self.root}/{self.map_id}/ev/revision"
 
     def query(self, op: str) -> str:
-        """QUERY: `integrate`, or a question."""
+        """QUERY: a question, which changes nothing."""
         return f"{self.root}/{self.map_id}/q/{op}"
 
     def control(self, verb: str) -> str:
-        """QUERY: one of `CONTROL_VERBS`."""
+        """QUERY: one of `CONTROL_VERBS`, or `CHANGE_ATOMS`."""
         return f"{self.root}/{self.map_id}/ctl/{verb}"
 
     def robot_token(self, robot: str) -> str:

@@ -94,7 +94,7 @@ class Message(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Cloud(Message, frozen=True, kw_only=True):
-    """One scan with its pose: the payload of `in/<robot>/cloud` and of `q/integrate`."""
+    """One scan with its pose: the payload of `in/<robot>/cloud` and of `in/<robot>/integrate`."""
 
     schema: ClassVar[str] = "pot.cloud.v1"
 
@@ -103,7 +103,8 @@ class Cloud(Message, frozen=True, kw_only=True):
     points: Array  # (N, 3) or (N, 2) float32, m, sensor frame; 2D is 3D with z = 0
     T_map_sensor: Array | None = None  # (4, 4) float64, rigid; absent = by the pose stream at stamp_ns
     is_return: Array | None = None  # (N,) bool; false = no echo, free up to the point; absent = all true
-    robot: Identifier | None = None  # who sends; needed by `q/integrate`, where the key does not say it
+    robot: Identifier | None = None  # who sends, in kept clouds; on the wire the key says it
+    session: Identifier | Absent = ABSENT  # one run of the sender; `seq` grows within it
 
 
 class Pose(Message, frozen=True, kw_only=True):
@@ -166,7 +167,7 @@ class ReceiptStatus(str, Enum):
 
 
 class Receipt(Message, frozen=True, kw_only=True):
-    """The answer to every cloud: `out/<robot>/receipt`, and the reply to `q/integrate`."""
+    """The answer to every cloud: `out/<robot>/receipt`, and the reply to `in/<robot>/integrate`."""
 
     schema: ClassVar[str] = "pot.receipt.v1"
 
@@ -186,7 +187,8 @@ class Receipt(Message, frozen=True, kw_only=True):
     n_kernels_transported: Count = 0  # of those, carried from atoms; the others were placed on the data
     map_kernels: Count = 0  # kernels in the overall map now
     sectors: list[SectorReport] = []  # how each sector was served
-    kernels: Kernels | None = None  # the instantaneous map; in `q/integrate` replies only
+    kernels: Kernels | None = None  # the instantaneous map; in replies to `in/<robot>/integrate` only
+    next_seq: Count | Absent = ABSENT  # `old_seq` only: the least `seq` of the session that would be taken
 
 
 class Params(Message, frozen=True, kw_only=True):
@@ -445,7 +447,7 @@ class Atom(Message, frozen=True, kw_only=True):
 
 
 class AtomsAction(str, Enum):
-    """What `q/atoms` is asked to do."""
+    """What `q/atoms` (read) and `ctl/atoms` (add, remove) are asked to do."""
 
     READ = "read"  # list the dictionary, or fetch one atom
     ADD = "add"  # put an atom into the dictionary, for every map of the server
@@ -453,7 +455,7 @@ class AtomsAction(str, Enum):
 
 
 class AtomsQuery(Message, frozen=True, kw_only=True):
-    """`q/atoms`: list the dictionary, fetch one atom whole, or change the dictionary."""
+    """`q/atoms`: list the dictionary, or fetch one atom whole. `ctl/atoms`: change the dictionary."""
 
     schema: ClassVar[str] = "pot.atoms_query.v1"
 
@@ -598,14 +600,16 @@ class ErrorCode(str, Enum):
     EMPTY = "empty"  # nothing to do: no points, or none inside the range limits
     TOO_LARGE = "too_large"  # bytes, points or cells beyond the limit
     OUT_OF_RANGE = "out_of_range"  # coordinates beyond what the map can hold
-    OLD_STAMP = "old_stamp"  # not newer than the robot's last accepted cloud
+    OLD_STAMP = "old_stamp"  # too far ahead of the server's clock
+    OLD_SEQ = "old_seq"  # not above the last accepted cloud of the robot's session
+    MAP_FULL = "map_full"  # the map has as many bytes, or robots, as it may
     NO_POSE = "no_pose"  # no pose given, and none to interpolate at the stamp
     UNKNOWN_ROBOT = "unknown_robot"  # not a legal id, or not on the allow list
     UNKNOWN_ATOM = "unknown_atom"  # not in the dictionary
     ATOM_REFUSED = (
         "atom_refused"  # the atom may not join the dictionary; the field `reason` says which rule it breaks
     )
-    READ_ONLY = "read_only"  # the server takes no changes of its dictionary
+    READ_ONLY = "read_only"  # the server takes no changes of its dictionary, or of anything
     UNSUPPORTED = "unsupported"  # no such operation or verb
     OVERLOADED = "overloaded"  # the queue is full; retry after retry_after_s
     DEADLINE = "deadline"  # the deadline passed before the work could start

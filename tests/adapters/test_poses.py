@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import threading
 import time
 
 import numpy as np
@@ -11,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from potserver.adapters.poses import PoseBuffer, interpolate
+from potserver.adapters.poses import PoseBuffer, PoseNotYetError, interpolate
 from potserver.domain.types import yaw_pose
 from potserver.errors import BadPoseError, NoPoseError, OldStampError
 
@@ -79,13 +78,22 @@ def test_outside_the_buffer_there_is_no_pose(robot: str, ms: int, why: str) -> N
         poses.at(robot, ms * MS)
 
 
-def test_a_late_pose_is_waited_for() -> None:
-    poses = PoseBuffer(wait_s=30)
+def test_who_waits_for_a_late_pose_is_told() -> None:
+    poses, told = PoseBuffer(), []
     poses.add("r", 10 * MS, yaw_pose(1, 0, 0))
-    later = threading.Timer(0.01, lambda: poses.add("r", 20 * MS, yaw_pose(3, 0, 0)))
-    later.start()
-    assert poses.at("r", 15 * MS)[0, 3] == pytest.approx(2.0)
-    later.join()
+    with pytest.raises(PoseNotYetError) as caught:
+        poses.at("r", 15 * MS)
+    poses.tell_when_reached("r", caught.value.stamp_ns, lambda: told.append("r"))
+    poses.add("other", 20 * MS, yaw_pose(0, 0, 0))
+    poses.add("r", 12 * MS, yaw_pose(2, 0, 0))
+    assert told == []
+    poses.add("r", 20 * MS, yaw_pose(3, 0, 0))
+    poses.add("r", 30 * MS, yaw_pose(3, 0, 0))
+    assert told == ["r"], "once"
+    poses.tell_when_reached("r", 15 * MS, lambda: told.append("late"))
+    assert told == ["r", "late"], "it had come in between"
+    poses.tell_when_reached("x", 15 * MS, lambda: told.append("x"))
+    assert len(told) == 2
 
 
 def test_it_is_bounded_in_poses_and_robots() -> None:

@@ -16,10 +16,11 @@ from potschemas import keys, messages, wire
 from potschemas.answers import AnswerRule
 from potschemas.messages import AtomsAction
 from potserver import errors
+from potserver.adapters.audit import Audit
 from potserver.adapters.questions import registry
-from potserver.adapters.questions.atoms import action_of
+from potserver.adapters.questions.atoms import CHANGE, check_changes, check_reads
 from potserver.adapters.questions.control import VERBS, work_of
-from potserver.adapters.questions.question import Asked, Served
+from potserver.adapters.questions.question import Asked, Question, Served
 from potserver.adapters.questions.registry import QUESTIONS
 from potserver.adapters.questions.tiles import decode_tiles
 from potserver.asking.grid import Grid
@@ -55,6 +56,7 @@ def served_map(mapper: MappingService, limits: Limits = LIMITS) -> Served:
         mapper=mapper,
         atoms=AtomStore(mapper.dictionary, mapper.use_dictionary),
         health=Health(),
+        audit=Audit(mapper.map_id),
         limits=limits,
         durable=False,
     )
@@ -62,11 +64,19 @@ def served_map(mapper: MappingService, limits: Limits = LIMITS) -> Served:
 
 def ask(op: str, query: messages.Message | bytes, served: Served | None = None) -> list[Any]:
     """The replies to `q/<op>`, of an empty map if none is given."""
-    served = served or served_map(MappingService(AtomDictionary(()), threads=1))
     (question,) = (q for q in QUESTIONS if q.op == op)
+    return replies(question, query, served)
+
+
+def replies(
+    question: Question[Any], query: messages.Message | bytes, served: Served | None = None
+) -> list[Any]:
+    """The replies to a question, of an empty map if none is given."""
+    served = served or served_map(MappingService(AtomDictionary(()), threads=1))
     payload = query if isinstance(query, bytes) else wire.encode(query)
     message = decode(payload, question.query, question.max_bytes or served.limits.max_query_bytes)
-    return list(question.answer(Asked(served, served.mapper.state, lambda: None), message))
+    steps = question.steps(Asked(served, served.mapper.state, "", lambda: None), message)
+    return [step.reply for step in steps if step.reply is not None]
 
 
 def outcome(read: Callable[[], Any]) -> str:
@@ -226,24 +236,27 @@ def atom_message() -> messages.Atom:
 
 
 def test_what_may_be_asked_of_the_atoms() -> None:
-    def asked(**fields: Any) -> AtomsAction:
-        return action_of(messages.AtomsQuery(**fields))
+    def read(**fields: Any) -> str:
+        return outcome(lambda: check_reads(messages.AtomsQuery(**fields)))
 
-    assert asked() is asked(atom_id="a") is asked(atom_id="a", action=AtomsAction.READ) is AtomsAction.READ
-    assert asked(atom_id="a", action=AtomsAction.REMOVE) is AtomsAction.REMOVE
+    def change(**fields: Any) -> str:
+        return outcome(lambda: check_changes(messages.AtomsQuery(**fields)))
+
     whole = atom_message()
-    assert asked(atom_id="wall.1", action=AtomsAction.ADD, atom=whole) is AtomsAction.ADD
+    assert read() == read(atom_id="a") == read(atom_id="a", action=AtomsAction.READ) == "ok"
+    assert read(atom=whole) == read(action=AtomsAction.READ, atom=whole) == "bad_message"
+    assert read(action=AtomsAction.REMOVE, atom_id="a") == "unsupported"
+    assert change(atom_id="a", action=AtomsAction.REMOVE) == "ok"
+    assert change(atom_id="wall.1", action=AtomsAction.ADD, atom=whole) == "ok"
+    assert change() == change(atom_id="a", action=AtomsAction.READ) == "unsupported"
     for fields in (
         {"action": AtomsAction.REMOVE},
         {"action": AtomsAction.ADD},
         {"action": AtomsAction.ADD, "atom_id": "a"},
         {"action": AtomsAction.ADD, "atom": whole, "atom_id": "other"},
-        {"action": AtomsAction.READ, "atom": whole},
-        {"atom": whole},
         {"action": AtomsAction.REMOVE, "atom_id": "wall.1", "atom": whole},
     ):
-        with pytest.raises(errors.BadMessageError):
-            asked(**fields)
+        assert change(**fields) == "bad_message"
 
 
 def test_an_unsound_atom_is_refused_before_the_dictionary_is_asked() -> None:
@@ -251,12 +264,12 @@ def test_an_unsound_atom_is_refused_before_the_dictionary_is_asked() -> None:
     whole = atom_message()
     short = msgspec.structs.replace(whole, hit_points=wire.encode_array(np.ones((4, 3), np.float32)))
     with pytest.raises(errors.ShapeError):
-        ask("atoms", messages.AtomsQuery(action=AtomsAction.ADD, atom=short), served)
+        replies(CHANGE, messages.AtomsQuery(action=AtomsAction.ADD, atom=short), served)
     assert len(served.atoms.dictionary) == 0
     assert served.health.counters() == {}
     with pytest.raises(errors.TooLargeError):
-        ask(
-            "atoms",
+        replies(
+            CHANGE,
             messages.AtomsQuery(action=AtomsAction.ADD, atom=whole),
             served_map(served.mapper, Limits(max_query_bytes=100)),
         )

@@ -86,8 +86,12 @@ def test_a_client_of_a_router_does_not_listen() -> None:
     assert get(build(mode="client"), "listen/endpoints") == []
 
 
-def test_shared_memory_can_be_turned_off() -> None:
-    assert get(build(shared_memory=False), "transport/shared_memory/enabled") is False
+def test_shared_memory_is_off_unless_it_is_asked_for() -> None:
+    assert get(build(), "transport/shared_memory/enabled") is False
+    assert get(build(shared_memory=True), "transport/shared_memory/enabled") is True
+    on = {"transport/shared_memory/enabled": True}
+    assert get(build(cfg=on), "transport/shared_memory/enabled") is True
+    assert get(build(cfg=on, shared_memory=False), "transport/shared_memory/enabled") is False
     key = "transport/shared_memory/transport_optimization/messages"
     assert get(build(cfg={key: ["put", "query"]}), key) == ["put", "query"]
 

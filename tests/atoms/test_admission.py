@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from potschemas import keys
-from potserver.atoms.admission import Refusal, admit, own_auc
+from potserver.atoms.admission import Refusal, admit, own_fit
 from potserver.atoms.distance import atom_distances, near_in_spread
 from potserver.domain.dictionary import AtomDictionary
 from potserver.domain.types import Atom, KernelSet
@@ -126,6 +126,10 @@ _BROKEN: dict[str, tuple[Refusal, Callable[[Atom], Atom]]] = {
     "a needle": (Refusal.WILD_KERNELS, _first_kernel(gamma_rate=1e-30)),
     "a kernel as wide as the world": (Refusal.WILD_KERNELS, _first_kernel(gamma_rate=1e30)),
     "a hinge that may be anywhere": (Refusal.WILD_KERNELS, _first_kernel(hinge_var=1e6)),
+    "weights that shout": (
+        Refusal.WILD_KERNELS,
+        lambda a: _kernels(a, weight_mean=a.kernels.weight_mean * 20),
+    ),
     "weights of the wrong sign": (
         Refusal.UNEXPLAINED,
         lambda a: _kernels(a, weight_mean=-a.kernels.weight_mean),
@@ -170,7 +174,7 @@ def test_twins_of_other_dimensions_do_not_count(flat: Atom) -> None:
     )
 
 
-def test_own_auc_against_counting_pairs(flat: Atom) -> None:
+def test_own_fit_against_counting_pairs(flat: Atom) -> None:
     kernels = flat.kernels
     scores = []
     for points in (flat.hit_points, flat.free_points):
@@ -178,9 +182,40 @@ def test_own_auc_against_counting_pairs(flat: Atom) -> None:
         scores.append(np.exp(-kernels.gamma.astype(np.float64) * d2) @ kernels.weight_mean)
     hits, free = scores
     wins = (hits[:, None] > free).mean() + 0.5 * (hits[:, None] == free).mean()
-    assert own_auc(flat) == pytest.approx(wins, abs=2e-3)
+    assert own_fit(flat).auc == pytest.approx(wins, abs=2e-3)
     silent = _kernels(flat, weight_mean=np.zeros_like(kernels.weight_mean))
-    assert own_auc(silent) == 0.5
+    assert own_fit(silent).auc == 0.5
+
+
+def _biased(atom: Atom, log_odds: float) -> Atom:
+    """The same ranking, with everything shifted: one wide kernel over the whole sector, as an attacker would add."""
+    middle = _kernels(
+        atom,
+        **{
+            name: getattr(atom.kernels, name)[:1].copy()
+            for name in ("hinge_mean", "hinge_var", "gamma_shape", "gamma_rate", "weight_mean", "weight_var")
+        },
+    ).kernels.replace(
+        hinge_mean=np.array([[atom.radius_m / 2, 0.0, 0.0]]),
+        gamma_rate=(atom.kernels.gamma_shape[:1] * 2.0 * 19.0**2).astype(np.float32),
+        weight_mean=np.array([log_odds], np.float32),
+    )
+    return dataclasses.replace(atom, kernels=KernelSet.concatenate([atom.kernels, middle]))
+
+
+@pytest.mark.parametrize("log_odds", [-20.0, 60.0], ids=["all free", "all occupied"])
+def test_poison_that_keeps_the_ranking_is_refused(builtin: AtomDictionary, log_odds: float) -> None:
+    """A ranking alone let such atoms in, and true walls went out of the maps that were built from them."""
+    for atom in builtin.of_dims(3).atoms[::4]:
+        poison = _biased(atom, log_odds)
+        assert own_fit(poison).auc > 0.9
+        assert _refusal(poison).reason == Refusal.UNCALIBRATED
+
+
+def test_built_in_atoms_answer_well_at_their_own_points(builtin: AtomDictionary) -> None:
+    fits = [own_fit(atom) for atom in builtin]
+    assert max(fit.nll_hits for fit in fits) < 0.4
+    assert max(fit.nll_free for fit in fits) < 0.5
 
 
 # --- distances ----------------------------------------------------------------------------------------------

@@ -46,6 +46,17 @@ def test_a_refusal_changes_nothing(builtin: AtomDictionary, tmp_path: Path) -> N
     assert not file.exists()
 
 
+def test_a_server_takes_no_more_atoms_than_scans_can_afford(builtin: AtomDictionary) -> None:
+    a, b, c = builtin.atoms[:3]
+    store = AtomStore(AtomDictionary([a]), lambda _: None, max_atoms=2)
+    store.add(b)
+    with pytest.raises(AtomRefusedError) as caught:
+        store.add(c)
+    assert caught.value.reason == "full"
+    store.remove(b.atom_id)
+    assert store.add(c).n_atoms == 2
+
+
 def test_a_read_only_store(builtin: AtomDictionary) -> None:
     store = AtomStore(AtomDictionary(), lambda _: None, writable=False)
     with pytest.raises(ReadOnlyError, match=r"atoms\.writable"):

@@ -35,7 +35,7 @@ def test_the_default_is_a_quiet_client(monkeypatch: pytest.MonkeyPatch) -> None:
     assert value(config, "connect/endpoints") == [DEFAULT_ENDPOINT]
     assert value(config, "scouting/multicast/enabled") is False
     assert value(config, SHM_MESSAGES) == ["put"]
-    assert value(config, "transport/shared_memory/enabled") is True
+    assert value(config, "transport/shared_memory/enabled") is False
 
 
 def test_flags_win_over_cfg_and_cfg_over_the_file_and_the_file_over_ours(
@@ -64,10 +64,10 @@ def test_flags_win_over_cfg_and_cfg_over_the_file_and_the_file_over_ours(
     assert value(config, "connect/endpoints") == ["tcp/127.0.0.1:2", "tcp/127.0.0.1:3"]
     assert value(config, "scouting/multicast/enabled") is False
     config = build_config(
-        options_of("--cfg", 'mode:"router"', "-m", "peer", "--no-shm", "-l", "tcp/127.0.0.1:0")
+        options_of("--cfg", 'mode:"router"', "-m", "peer", "--shm", "-l", "tcp/127.0.0.1:0")
     )
     assert value(config, "mode") == "peer"
-    assert value(config, "transport/shared_memory/enabled") is False
+    assert value(config, "transport/shared_memory/enabled") is True
     assert value(config, "listen/endpoints") == ["tcp/127.0.0.1:0"]
 
 
@@ -86,3 +86,10 @@ def build_config_with_environment(monkeypatch: pytest.MonkeyPatch, file: Path) -
 def test_endpoints_that_are_none_are_refused(endpoint: str) -> None:
     with pytest.raises(UsageError, match="PROTOCOL/ADDRESS"):
         build_config(SessionOptions(connect=(endpoint,)))
+
+
+def test_a_secret_in_the_command_line_is_refused_with_the_way_to_do_it() -> None:
+    for given in ("transport/auth/usrpwd/password:hush", 'transport/auth:{usrpwd:{password:"hush"}}'):
+        with pytest.raises(UsageError, match="ZENOH_CONFIG") as refused:
+            options_of("--cfg", given)
+        assert "hush" not in str(refused.value)

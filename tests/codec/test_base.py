@@ -5,12 +5,18 @@ from __future__ import annotations
 import inspect
 from typing import Any
 
+import msgpack
 import pytest
 
 from potschemas import messages, wire
+from potschemas.answers import AnswerRule
 from potschemas.messages import ErrorCode
 from potserver import errors
+from potserver.codec.atoms import encode_atom
 from potserver.codec.base import check_encoding, check_size, decode, encode_error
+from potserver.codec.clouds import UNKNOWN_SEQ, decode_cloud_head
+from potserver.domain.dictionary import AtomDictionary
+from potserver.domain.types import Atom
 from potserver.errors import PotserverError, error_classes
 
 
@@ -78,3 +84,26 @@ def test_an_empty_payload_is_a_message_of_defaults() -> None:
         assert decode(b"", kind) == kind()
     with pytest.raises(errors.BadMessageError):
         decode(b"", messages.GridQuery)
+
+
+@pytest.mark.parametrize(
+    "filler", [[0] * 1990, [{}] * 1990, {f"k{i}": [] for i in range(995)}], ids=["numbers", "maps", "keys"]
+)
+def test_a_request_of_many_values_is_refused_before_it_is_walked(filler: Any) -> None:
+    """Walking 100,000 values would hold the interpreter for 30 ms, and one client can send many such messages a second."""
+    fits = msgpack.packb({"filler": filler})
+    assert decode(fits, messages.InfoQuery, 10**6) == messages.InfoQuery()
+    assert decode_cloud_head(fits).seq == UNKNOWN_SEQ
+    more = msgpack.packb({"filler": filler, "more": [0] * 10})
+    with pytest.raises(errors.BadMessageError, match="more than 2000 values"):
+        decode(more, messages.InfoQuery, 10**6)
+    with pytest.raises(errors.BadMessageError, match="entries, the limit is 2000"):
+        decode(msgpack.packb([0] * 2001), messages.InfoQuery, 10**6)
+
+
+@pytest.mark.parametrize("atom", AtomDictionary.builtin().atoms[::20], ids=lambda atom: atom.atom_id)
+def test_the_largest_requests_are_far_below(atom: Atom) -> None:
+    whole = encode_atom(atom, {}, AnswerRule())
+    query = messages.AtomsQuery(action=messages.AtomsAction.ADD, atom=whole)
+    payload = wire.encode(query)
+    assert decode(payload, messages.AtomsQuery, len(payload)) == query

@@ -46,7 +46,7 @@ def saved(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for number, robot in ((1, "ada"), (2, "bob")):
         service.integrate(make_scan(number, robot))
     path = tmp_path_factory.mktemp("saved") / "rooms.map"
-    write_map(path, service.state, Origin("site", True, {"ada": 1, "bob": 2}))
+    write_map(path, service.state, Origin("site", True, {"ada": {"": 1}, "bob": {"": 2}}))
     return path
 
 
@@ -62,7 +62,7 @@ def test_info_counts_what_is_there(saved: Path, run: Run) -> None:
     tiles = state.tiled.tiles.values()
     wanted = {
         "map": "site",
-        "format": 1,
+        "format": 2,
         "scans": 2,
         "revision": 2,
         "robots": ["ada", "bob"],
@@ -292,7 +292,7 @@ def test_a_snapshot_is_rescued_from_a_store(tmp_path: Path, run: Run) -> None:
         scan = make_scan(number)
         service.integrate(scan, commit=lambda scan=scan: store.append(scan))
         if number == 1:
-            store.save(None, service, {"r1": scan.stamp_ns})
+            store.save(None, service, {"r1": {"": scan.seq}})
             first = service.state
     shutil.copytree(tmp_path / "store", tmp_path / "killed")  # as a kill would leave it now
     store.close()
@@ -300,7 +300,7 @@ def test_a_snapshot_is_rescued_from_a_store(tmp_path: Path, run: Run) -> None:
     assert code == 0
     assert "1 scans of the journal are not in it" in out
     rescued = read_map(tmp_path / "rescued.map")
-    assert (rescued.record.n_scans, rescued.record.stamps) == (1, {"r1": 1_000_000_000})
+    assert (rescued.record.n_scans, rescued.record.heard) == (1, {"r1": {"": 1}})
     assert rescued.record.answer_rule == first.snapshot.rule
 
 
@@ -329,13 +329,13 @@ def test_what_cannot_be_imported_says_why(tmp_path: Path, run: Run) -> None:
 def test_two_saved_maps_become_one(tmp_path: Path, saved: Path, run: Run) -> None:
     service = MappingService(settings=SETTINGS, threads=1)
     service.integrate(make_scan(3, "eve"))
-    write_map(tmp_path / "eve.map", service.state, Origin("site", True, {"eve": 3}))
+    write_map(tmp_path / "eve.map", service.state, Origin("site", True, {"eve": {"": 3}}))
     out = tmp_path / "both.map"
     code, text, _ = run("merge", saved, tmp_path / "eve.map", "--pose", 100, 0, 0, 90, "-o", out)
     assert code == 0
     assert "tiles changed" in text
     merged, alone = read_map(out), read_map(saved)
-    assert merged.record.stamps == {"ada": 1, "bob": 2, "eve": 3}
+    assert merged.record.heard == {"ada": {"": 1}, "bob": {"": 2}, "eve": {"": 3}}
     assert merged.state().n_scans == 3
     assert merged.state().tiled.robots == ("ada", "bob", "eve")
     hinge = np.concatenate([part.kernels.hinge_mean for part in merged.tiled.parts.values()])
@@ -347,7 +347,7 @@ def test_two_saved_maps_become_one(tmp_path: Path, saved: Path, run: Run) -> Non
 def test_maps_of_two_kinds_are_not_merged(tmp_path: Path, saved: Path, run: Run) -> None:
     paper = MappingService(settings=MappingSettings.of_profile("paper"), threads=1)
     paper.integrate(make_scan(1, "ada"))
-    write_map(tmp_path / "paper.map", paper.state, Origin("site", False, {"ada": 1}))
+    write_map(tmp_path / "paper.map", paper.state, Origin("site", False, {"ada": {"": 1}}))
     code, _, err = run("merge", saved, tmp_path / "paper.map", "-o", tmp_path / "out.map")
     assert code == 2
     assert "cannot be merged" in err

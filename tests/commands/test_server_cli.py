@@ -19,6 +19,7 @@ import pytest
 from potclient.atoms import Atom
 from potschemas import __version__
 from potserver import cli
+from potserver.adapters.session import ZenohSettings
 from potserver.commands.config import to_toml
 from potserver.commands.serve import StopSignals
 from potserver.config import Leaf, Settings, as_tree, load_settings
@@ -175,6 +176,8 @@ def test_a_mistake_is_one_line_and_exit_code_two(
         ["atoms", "import"],
         ["map"],
         ["map", "info"],
+        ["map", "check"],
+        ["map", "upgrade"],
         ["map", "export"],
         ["map", "import"],
         ["map", "merge"],
@@ -286,6 +289,49 @@ def test_events_are_json_lines_with_their_fields() -> None:
     assert foreign["event"] == "callback error"
 
 
+def test_no_secret_is_logged() -> None:
+    stream = io.StringIO()
+    configure_logging("debug", "json", stream)
+    cfg = {
+        "transport/auth/usrpwd/password": "hush",
+        "transport/auth": '{usrpwd: {user: "u", password: "hush"}}',
+    }
+    settings = Settings(zenoh=ZenohSettings(cfg=cfg))
+    get_logger("potserver.test").debug("settings_in_use", settings=as_tree(settings))
+    assert "hush" not in stream.getvalue()
+    assert "usrpwd" in stream.getvalue()
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("--cfg", "transport/auth/usrpwd/password:hush"),
+        ("--cfg", 'transport/auth:{usrpwd:{user:"u",password:"hush"}}'),
+        ("--set", 'zenoh.cfg={"transport/auth/usrpwd/password"="hush"}'),
+        ("--connect", "tls/h:7447#connect_private_key_base64=hush"),
+    ],
+)
+def test_secrets_in_the_command_line_are_refused_with_the_way_to_do_it(
+    capsys: pytest.CaptureFixture[str], words: tuple[str, str]
+) -> None:
+    assert cli.main(["config", "show", *words]) == 2
+    told = capsys.readouterr()
+    assert "--config" in told.err
+    assert "POTSERVER_ZENOH__CFG" in told.err
+    assert "hush" not in told.err + told.out
+
+
+def test_secrets_of_variables_are_taken_and_not_shown(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("POTSERVER_ZENOH__CFG", '{"transport/auth/usrpwd/password" = "hush"}')
+    for form in ((), ("--json",)):
+        assert cli.main(["config", "show", *form]) == 0
+        text = capsys.readouterr().out
+        assert "usrpwd/password" in text
+        assert "hush" not in text
+
+
 def test_on_a_console_they_are_for_people() -> None:
     stream = io.StringIO()
     configure_logging("debug", "console", stream)
@@ -302,7 +348,7 @@ def test_serve_help_says_who_may_write(capsys: pytest.CaptureFixture[str]) -> No
     with pytest.raises(SystemExit):
         cli.main(["serve", "--help"])
     text = " ".join(capsys.readouterr().out.split())
-    assert "Anyone who reaches the port may write: use Zenoh's access control and TLS." in text
+    assert "Anyone who reaches the port may write: `potserver acl` writes access rules and TLS." in text
     assert "security notes" not in text
 
 

@@ -8,9 +8,18 @@ import numpy as np
 import pytest
 
 from potserver.domain.kernel_map import KernelMap
-from potserver.domain.tiles import CARRIED, COARSE, MapKernels, Region, TiledMap, TileGrid
-from potserver.domain.types import Float64, KernelSet
-from potserver.errors import SettingsError, ShapeError
+from potserver.domain.tiles import (
+    CARRIED,
+    COARSE,
+    MapKernels,
+    MapSize,
+    Region,
+    TiledMap,
+    TileGrid,
+    check_reach,
+)
+from potserver.domain.types import Float64, KernelSet, yaw_pose
+from potserver.errors import OutOfRangeError, SettingsError, ShapeError
 from potserver.mapping.placing import kernels_at
 from potserver.numerics.evidence import add, positions
 
@@ -154,3 +163,27 @@ def test_new_kernels_have_their_weights_as_prior() -> None:
     assert len(MapKernels.concatenate([])) == 0
     with pytest.raises(ShapeError):
         dataclasses.replace(kernels, kernels=KernelSet.empty())
+
+
+def test_a_map_may_be_moved_as_far_as_maps_may_be_and_no_further() -> None:
+    tiled = _map(np.zeros(3))
+    check_reach(tiled, yaw_pose(1000.0, 0.0, 1.0), 1100.0)
+    for x_m in (1100.0, -1100.0, 3e10, 1e300):
+        with pytest.raises(OutOfRangeError, match="the limit is 1100 m"):
+            check_reach(tiled, yaw_pose(x_m, 0.0, 1.0), 1100.0)
+    check_reach(TiledMap.empty(tiled.grid), yaw_pose(1e300, 0.0, 0.0), 1100.0)
+
+
+def test_the_size_of_a_map_follows_its_changes() -> None:
+    tiled, size = _map(np.zeros(3)), MapSize()
+    whole = sum(tile.n_bytes for tile in tiled.tiles.values())
+    assert size.of(None) == 0
+    assert size.of(tiled) == whole > 10_000
+    first, second = list(tiled.tiles)[:2]
+    empty = tiled.tiles[first]._replace(
+        rows=tiled.tiles[first].rows.take(slice(0, 0)), kernels=tiled.tiles[first].kernels.take(slice(0, 0))
+    )
+    changed = tiled.with_tiles({first: empty, second: tiled.tiles[first]})
+    assert size.of(changed) == sum(tile.n_bytes for tile in changed.tiles.values()) != whole
+    assert size.of(tiled) == MapSize().of(tiled) == whole
+    assert size.of(None) == 0

@@ -96,8 +96,10 @@ class Client:
         return answers
 
     def ask(self, op: str, payload: Any = None, **options: Any) -> list[messages.Message]:
-        """All replies to `q/<op>`; at least one."""
-        answers = self.get(self.keys.query(op), payload, **options)
+        """All replies to `q/<op>`, or to the `integrate` of the robot that a cloud names; at least one."""
+        robot = getattr(payload, "robot", None) or "r1"
+        key = self.keys.integrate(robot) if op == "integrate" else self.keys.query(op)
+        answers = self.get(key, payload, **options)
         assert answers, f"nobody answered {op}"
         return answers
 
@@ -426,6 +428,7 @@ def map_server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[MapServer]:
             "limits.max_query_points": 5000,
             "store.directory": str(tmp_path_factory.mktemp("store")),
             "store.fsync": False,
+            "atoms.writable": True,
         }
     )
     with MapServer(settings, listen="tcp/127.0.0.1:0") as server:

@@ -58,14 +58,17 @@ class ScriptedServer:
         self._token.undeclare()
 
     def on(self, op: str, *answers: Answer) -> None:
-        """Answer `q/<op>`, or `ctl/<op>` for a verb.
+        """Answer `q/<op>`, `ctl/<op>` for a verb or an operation named so, or `in/*/integrate`.
 
         Args:
             op: Which questions.
             answers: One for each question that comes; the last one for all others too. Each is a list of replies, one reply,
                 HOLD, or a function that makes one of these from the bytes of the question.
         """
-        key = self.keys.control(op) if op in CONTROL_VERBS else self.keys.query(op)
+        if op in CONTROL_VERBS or op.startswith("ctl/"):
+            key = self.keys.control(op.removeprefix("ctl/"))
+        else:
+            key = self.keys.integrate("*") if op == "integrate" else self.keys.query(op)
         queryable = self.session.declare_queryable(key, zenoh.handlers.FifoChannel(32), complete=True)
 
         def run() -> None:
@@ -73,7 +76,7 @@ class ScriptedServer:
                 question = query.payload.to_bytes() if query.payload is not None else b""
                 self.asked.append((op, question))
                 answer = answers[min(n, len(answers) - 1)]
-                self._reply(query, key, answer(question) if callable(answer) else answer)
+                self._reply(query, answer(question) if callable(answer) else answer)
 
         self._start(queryable, run)
 
@@ -116,7 +119,8 @@ class ScriptedServer:
         thread.start()
         self._threads.append(thread)
 
-    def _reply(self, query: zenoh.Query, key: str, answer: Answer) -> None:
+    def _reply(self, query: zenoh.Query, answer: Answer) -> None:
+        key = query.key_expr
         if answer is HOLD:
             self._held.append(query)
             return

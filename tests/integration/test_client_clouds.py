@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from potclient import FeedOptions, MapClient, feed
-from potclient.errors import NoPoseError, OldStampError, OverloadedError, UsageError
+from potclient.errors import NoPoseError, OldSequenceError, OverloadedError, UsageError
 from potclient.kernels import KernelSet
 from potclient.results import Receipt
 from potschemas import messages
@@ -70,9 +70,9 @@ def test_a_cloud_goes_as_it_was_given() -> None:
 
 
 def test_a_cloud_that_the_server_refuses_raises(map_client: MapClient) -> None:
-    map_client.integrate(room(), pose(), robot="late")
-    with pytest.raises(OldStampError, match="before the last accepted cloud") as caught:
-        map_client.integrate(room(), pose(), robot="late", stamp_ns=5)
+    map_client.integrate(room(), pose(), robot="late", seq=7)
+    with pytest.raises(OldSequenceError, match="8 or more would be taken") as caught:
+        map_client.integrate(room(), pose(), robot="late", seq=7)
     assert not caught.value.retryable
 
 
@@ -175,10 +175,11 @@ def test_a_lost_receipt_does_not_stall_the_feed() -> None:
 
 
 def test_rejections_are_counted_with_their_reason(map_client: MapClient) -> None:
-    map_client.integrate(room(), pose(), robot="b")
-    map_client.publish(room(), pose(), robot="b", stamp_ns=5, wait=True)
+    map_client.integrate(room(), pose(), robot="b", seq=7)
+    map_client.publish(room(), pose(), robot="b", seq=5, wait=True)
     receipts = list(map_client.receipts("b", DEADLINE_S))
-    assert [(r.status, r.reason) for r in receipts] == [(ReceiptStatus.REJECTED, "old_stamp")]
+    assert [(r.status, r.reason) for r in receipts] == [(ReceiptStatus.REJECTED, "old_seq")]
+    assert receipts[0].message.next_seq == 8
     assert map_client.counts().rejected == 1
 
 

@@ -168,7 +168,7 @@ def test_publish_fails_if_a_scan_is_not_accepted(run: Run, how: list[str]) -> No
     status, out, _ = run(*words, "--robot", f"again{len(how)}", *how)
     assert status == 1
     assert "0 of 2 scans accepted" in out
-    assert "old_stamp: the stamp is" in out
+    assert "old_seq: cloud " in out
 
 
 def test_publish_fails_if_a_scan_has_no_receipt(run_at: Run) -> None:
@@ -202,7 +202,7 @@ def test_a_quiet_publish_still_says_why_scans_were_refused(run: Run, how: list[s
     status, _, err = run(*words, *how)
     assert status == 1
     (line,) = [line for line in err.splitlines() if "not accepted" in line]
-    assert line.startswith("not accepted: 3 old_stamp (the stamp is ")
+    assert line.startswith("not accepted: 3 old_seq (cloud ")
 
 
 @pytest.mark.parametrize("how", [[], ["--drop", "--rate", "50"]])

@@ -11,7 +11,7 @@ import pytest
 import zenoh
 
 from potclient.client import MapClient
-from potclient.errors import ClosedError, NoServerError, UsageError
+from potclient.errors import ClosedError, NoServerError, PotclientError, UsageError
 from potclient.link import Link
 from potclient.results import Receipt
 from potclient.session import SessionOptions, open_session
@@ -20,9 +20,9 @@ from potschemas.keys import MapKeys
 from potserver.config import load_settings
 from potserver.server import MapServer
 
-from .conftest import DEADLINE_S, in_background
+from .conftest import DEADLINE_S, in_background, until
 from .rooms import pose, room
-from .scripted import free_port
+from .scripted import HOLD, ScriptedServer, free_port
 
 # --- who serves ----------------------------------------------------------------------------------------------------
 
@@ -237,3 +237,32 @@ client.info()
         [sys.executable, "-c", program], timeout=2 * DEADLINE_S, capture_output=True, text=True, check=False
     )
     assert done.returncode == status, done.stderr
+
+
+class InUse:
+    """A declaration that another thread is using: the library refuses to undeclare it."""
+
+    def undeclare(self) -> None:
+        raise RuntimeError("Already borrowed")
+
+
+def test_a_close_goes_on_where_another_thread_is_asking() -> None:
+    """Broken off half way it left threads inside Zenoh, and such a thread aborts the process when it ends."""
+    with ScriptedServer() as server:
+        server.on("points", HOLD)
+        client = MapClient(server.endpoint, timeout_s=DEADLINE_S)
+        client.wait_ready()
+        link = client._link
+        link._declared.insert(0, InUse())
+        # a question whose limits are known: it goes out at once
+        asked = in_background(
+            lambda: list(link.samples(client.keys.query("points"), messages.InfoQuery(), None))
+        )
+        until(lambda: server.count("points") == 1, "the question")
+        before = [thread for thread in threading.enumerate() if thread.name.startswith("potclient-")]
+        assert before
+        client.close()
+        assert link.n_calls == 0, "nobody is inside Zenoh any more"
+        assert not [thread for thread in before if thread.is_alive()]
+        with pytest.raises(PotclientError):
+            asked()

@@ -69,7 +69,7 @@ def test_a_recording_may_keep_its_stamps(make_rig: Any) -> None:
         assert play(client, recording, Sending(keep_stamps=True, robot="old")).all_accepted
         again = play(client, recording, Sending(keep_stamps=True, robot="old", acknowledged=True))
     assert [scan.stamp_ns for scan in rig.mapper.scans] == [scan.stamp_ns for scan in recording]
-    assert {(s.status, s.reason) for s in again.scans} == {("rejected", "old_stamp")}
+    assert {(s.status, s.reason) for s in again.scans} == {("rejected", "old_seq")}
 
 
 def test_a_scan_that_is_not_accepted_shows_in_the_report(

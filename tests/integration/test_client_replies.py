@@ -115,7 +115,7 @@ def test_every_error_code_has_its_exception(server: ScriptedServer, client: MapC
 
 def test_a_reason_travels_with_its_error(server: ScriptedServer, client: MapClient) -> None:
     server.on(
-        "atoms",
+        "ctl/atoms",
         messages.ErrorReply(code=ErrorCode.READ_ONLY, message="no", reason="closed"),
         ErrorCode.READ_ONLY,
     )

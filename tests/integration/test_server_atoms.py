@@ -18,7 +18,7 @@ from potserver.config import load_settings
 from potserver.domain.dictionary import AtomDictionary
 from potserver.server import MapServer
 
-FAST = {"mapping.max_range_m": 15.0, "mapping.beams_per_scan": 600, "threads": 1}
+FAST = {"mapping.max_range_m": 15.0, "mapping.beams_per_scan": 600, "threads": 1, "atoms.writable": True}
 ORIGIN = np.eye(4)
 
 Serve = Callable[..., MapClient]
@@ -142,8 +142,11 @@ def test_a_refused_atom_changes_nothing_and_says_why(serve: Serve, site: Path) -
     assert client.add_atom(mirrored(atom, "mirrored")).n_atoms == len(before) + 1
 
 
-def test_a_read_only_server(serve: Serve, site: Path) -> None:
-    client = serve(dictionary=str(site), atoms__writable=False)
+def test_a_server_is_read_only_unless_it_is_told_otherwise(
+    serve: Serve, site: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delitem(FAST, "atoms.writable")
+    client = serve(dictionary=str(site))
     before = names(client)
     atom = client.atom(before[0])
     with pytest.raises(ReadOnlyError):

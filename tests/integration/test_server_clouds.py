@@ -223,8 +223,36 @@ def test_a_stamp_from_the_future_is_refused_and_not_remembered(make_rig: MakeRig
     until(lambda: client.stats().counters.get("poses.rejected.old_stamp") == 1, "the refusal")
 
 
-def test_old_stamps_may_be_allowed(make_rig: MakeRig) -> None:
-    client = make_rig(intake__allow_old_stamps=True).client()
+def test_a_clock_that_goes_back_shuts_no_robot_out(make_rig: MakeRig) -> None:
+    client = make_rig().client()
+    now_ns = time.time_ns()
+    client.one("integrate", make_cloud(seq=1, robot="r1", session="boot1", stamp_ns=now_ns))
+    for seq in (2, 3):
+        late = make_cloud(seq=seq, robot="r1", session="boot1", stamp_ns=now_ns - 3600 * 10**9)
+        assert client.one("integrate", late).status is ReceiptStatus.ACCEPTED
+    again = make_cloud(seq=0, robot="r1", session="boot2", stamp_ns=5)  # rebooted, without a clock
+    assert client.one("integrate", again).map_revision == 4
+
+
+def test_a_forged_cloud_ahead_shuts_nobody_out_and_old_ones_stay_old(make_rig: MakeRig) -> None:
+    rig = make_rig()
+    client = rig.client()
+    receipts = client.receipts("r1")
+    now_ns = time.time_ns()
+    client.one("integrate", make_cloud(seq=7, robot="r1", session="mine", stamp_ns=now_ns))
+    forged = make_cloud(seq=2**62, robot="r1", session="other", stamp_ns=now_ns + int(4.9e9))
+    client.one("integrate", forged)
+    client.put_cloud(make_cloud(seq=8, session="mine", stamp_ns=now_ns + 1))
+    client.put_cloud(make_cloud(seq=7, session="mine", stamp_ns=now_ns + 2))
+    taken, refused = drain(receipts, 2)
+    assert (taken.seq, taken.status) == (8, ReceiptStatus.ACCEPTED)
+    assert (refused.seq, refused.reason, refused.next_seq) == (7, "old_seq", 9)
+    assert "9 or more would be taken" in refused.message
+    assert client.error("integrate", forged).code is ErrorCode.OLD_SEQ
+
+
+def test_repeats_may_be_allowed(make_rig: MakeRig) -> None:
+    client = make_rig(intake__allow_repeats=True).client()
     client.one("integrate", make_cloud(seq=5, robot="r1"))
     assert client.one("integrate", make_cloud(seq=4, robot="r1")).map_revision == 2
 
@@ -246,7 +274,7 @@ def test_a_cloud_without_a_pose_takes_the_one_at_its_stamp(make_rig: MakeRig) ->
 def test_a_cloud_waits_a_moment_for_the_pose_after_it(
     make_rig: MakeRig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("potserver.node.WAIT_S", DEADLINE_S)
+    monkeypatch.setattr("potserver.adapters.writer.WAIT_S", DEADLINE_S)
     rig = make_rig()
     client = rig.client()
     pose = pose_message(1_000_000_000, 1.0)
@@ -259,6 +287,43 @@ def test_a_cloud_waits_a_moment_for_the_pose_after_it(
     client.put(client.keys.pose("r1"), wire.encode(pose), wire.encoding_of(pose))
     assert waiting().status is ReceiptStatus.ACCEPTED
     np.testing.assert_allclose(rig.mapper.scans[0].T_map_sensor[0, 3], 2.0)
+
+
+def test_clouds_that_wait_for_their_pose_hold_up_no_other_robot(
+    make_rig: MakeRig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("potserver.adapters.writer.WAIT_S", DEADLINE_S)
+    rig = make_rig()
+    client = rig.client()
+    pose = pose_message(1_000_000_000, 1.0)
+    for i in range(8):
+        client.put(client.keys.pose(f"late{i}"), wire.encode(pose), wire.encoding_of(pose))
+    until(lambda: client.stats().counters.get("poses.accepted") == 8, "the poses")
+    ahead = make_cloud(T_map_sensor=None, stamp_ns=1_100_000_000)
+    waiting = [
+        in_background(lambda i=i: client.get(client.keys.integrate(f"late{i}"), ahead)) for i in range(8)
+    ]
+    until(lambda: client.stats().queues["clouds.depth"] == 8, "eight clouds waiting")
+    for seq in range(3):
+        assert client.one("integrate", make_cloud(seq=seq, robot="swift")).status is ReceiptStatus.ACCEPTED
+    assert client.stats().queues["clouds.depth"] == 8
+    pose = pose_message(1_200_000_000, 3.0)
+    for i in range(8):
+        client.put(client.keys.pose(f"late{i}"), wire.encode(pose), wire.encoding_of(pose))
+    for result in waiting:
+        (receipt,) = result()
+        assert receipt.status is ReceiptStatus.ACCEPTED
+        assert receipt.wait_ms > 0
+
+
+def test_a_pose_that_does_not_come_is_named(make_rig: MakeRig) -> None:
+    client = make_rig().client()
+    pose = pose_message(1_000_000_000, 1.0)
+    client.put(client.keys.pose("r1"), wire.encode(pose), wire.encoding_of(pose))
+    until(lambda: client.stats().counters.get("poses.accepted") == 1, "a pose")
+    error = client.error("integrate", make_cloud(T_map_sensor=None, stamp_ns=1_100_000_000))
+    assert error.code is ErrorCode.NO_POSE
+    assert "ends 100.0 ms before it" in error.message
 
 
 def test_bad_poses_are_counted(make_rig: MakeRig) -> None:

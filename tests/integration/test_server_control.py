@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
+import zenoh
 
 from potschemas import messages
 from potschemas.messages import ErrorCode, ReceiptStatus
@@ -19,7 +21,7 @@ from .conftest import (
 )
 
 
-def test_clear_comes_after_the_clouds_before_it_and_forgets_the_stamps(make_rig: MakeRig) -> None:
+def test_clear_comes_after_the_clouds_before_it_and_forgets_the_numbers(make_rig: MakeRig) -> None:
     rig = make_rig()
     client = rig.client()
     receipts = client.receipts("r1")
@@ -29,7 +31,7 @@ def test_clear_comes_after_the_clouds_before_it_and_forgets_the_stamps(make_rig:
     until(lambda: client.stats().queues["clouds.depth"] == 1, "one in work, one waiting")
     cleared = in_background(lambda: client.control("clear"))
     until(lambda: rig.server.nodes["default"].intake.n_barriers, "the barrier")
-    client.put_cloud(make_cloud(seq=1))  # an old stamp, but the map will be empty by then
+    client.put_cloud(make_cloud(seq=1))  # an old number, but the map will be empty by then
     until(lambda: client.stats().queues["clouds.depth"] == 2, "both waiting")
     rig.mapper.mapping.release()
     reply = cleared()
@@ -105,3 +107,24 @@ def test_a_drain_that_could_not_be_queued_has_not_drained(make_rig: MakeRig) -> 
     rig.mapper.mapping.release()
     assert client.one("integrate", make_cloud(seq=1, robot="r1")).map_revision == 2
     assert client.alive(client.keys.server_token("potserver"))
+
+
+def test_changes_and_refusals_are_audit_lines_with_who_and_what(
+    make_rig: MakeRig, caplog: pytest.LogCaptureFixture
+) -> None:
+    client = make_rig(intake__robots="r1").client()
+    with caplog.at_level("INFO", logger="potserver.audit"):
+        source = zenoh.SourceInfo(client.session.declare_querier(client.keys.control("clear")).id, 1)
+        list(client.session.get(client.keys.control("clear"), source_info=source))
+        client.control("load")
+        client.error("integrate", make_cloud(seq=1, robot="r2"))
+        client.error("points", b"no message")
+    told = [record.msg for record in caplog.records if record.name == "potserver.audit"]
+    assert [(line["event"], line["what"], line.get("reason")) for line in told] == [
+        ("change_made", "control.clear", None),
+        ("refused", "control.load", "bad_message"),
+        ("refused", "queries.integrate", "unknown_robot"),
+        ("refused", "queries.points", "bad_message"),
+    ]
+    assert told[0]["who"] == str(client.session.zid())
+    assert all(line["map_id"] == "default" and line["timestamp"] for line in told)

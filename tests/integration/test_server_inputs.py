@@ -176,10 +176,26 @@ def test_a_cloud_that_names_another_robot_than_its_key_is_refused(real_client: C
     assert receipts.get(timeout=30).reason == "bad_message"
 
 
-def test_integrate_needs_to_know_the_robot(real_client: Client) -> None:
-    error = real_client.error("integrate", make_cloud())
+def test_a_robot_integrates_on_its_own_key_alone(real_client: Client) -> None:
+    (error,) = real_client.get(real_client.keys.integrate("r1"), make_cloud(robot="r2"))
     assert error.code is ErrorCode.BAD_MESSAGE
-    assert "robot" in error.message
+    assert "its key says 'r1'" in error.message
+    (error,) = real_client.get(real_client.keys.integrate("R 1"), make_cloud())
+    assert error.code is ErrorCode.UNKNOWN_ROBOT
+    assert real_client.one("integrate", make_cloud(seq=70)).robot == "r1"
+
+
+def test_keys_that_moved_say_where_to(real_client: Client) -> None:
+    (error,) = real_client.get(real_client.keys.query("integrate"), make_cloud(robot="r1"))
+    assert error.code is ErrorCode.UNSUPPORTED
+    assert "in/<robot>/integrate" in error.message
+    remove = messages.AtomsQuery(action=messages.AtomsAction.REMOVE, atom_id="a")
+    error = real_client.error("atoms", remove)
+    assert error.code is ErrorCode.UNSUPPORTED
+    assert "ctl/atoms" in error.message
+    error = real_client.control("atoms", messages.AtomsQuery())
+    assert error.code is ErrorCode.UNSUPPORTED
+    assert "q/atoms" in error.message
 
 
 @pytest.mark.parametrize("encoding", ["application/msgpack;pot.cloud.v2", "application/json", "text/plain"])
@@ -196,13 +212,13 @@ def test_a_message_without_an_encoding_is_taken_for_what_its_key_says(real_clien
     assert isinstance(answer, messages.Occupancy)
 
 
-def test_an_old_stamp_is_refused_and_a_newer_one_is_not(real_client: Client) -> None:
+def test_an_old_number_is_refused_and_a_higher_one_is_not(real_client: Client) -> None:
     first = real_client.one("integrate", make_cloud(seq=50, robot="clock"))
     for seq in (50, 49):
-        assert real_client.error("integrate", make_cloud(seq=seq, robot="clock")).code is ErrorCode.OLD_STAMP
+        assert real_client.error("integrate", make_cloud(seq=seq, robot="clock")).code is ErrorCode.OLD_SEQ
     receipts = real_client.receipts("clock")
     real_client.put_cloud(make_cloud(seq=50), robot="clock")
-    assert receipts.get(timeout=30).reason == "old_stamp"
+    assert receipts.get(timeout=30).reason == "old_seq"
     assert real_client.one("info").map_revision == first.map_revision
     assert real_client.one("integrate", make_cloud(seq=51, robot="clock")).map_revision > first.map_revision
 

@@ -10,15 +10,20 @@ import time
 import types
 from typing import Any
 
+import msgspec
+import numpy as np
 import pytest
 
 from potschemas import messages, wire
 from potschemas.messages import ErrorCode
+from potserver.domain.types import KernelSet
 
 from .conftest import (
     DEADLINE_S,
     HERE,
     ROOT,
+    FakeMapper,
+    FakeSnapshot,
     MakeRig,
     in_background,
     make_cloud,
@@ -47,13 +52,16 @@ def test_queries_never_wait_for_a_scan(make_rig: MakeRig) -> None:
     assert client.one("info").map_revision == 0
 
 
+MANY = points_query(np.zeros((4000, 3)))  # 96 kB: no short question
+
+
 def test_a_full_query_queue_answers_at_once_and_loses_nobody(make_rig: MakeRig) -> None:
     rig = make_rig(queries__threads=1, queries__max_queued=4)
     client = rig.client()
     rig.mapper.queries.hold()
-    held = in_background(lambda: client.one("points", HERE))
+    held = in_background(lambda: client.one("points", MANY))
     rig.mapper.queries.wait_entered()
-    asked = [in_background(lambda: client.ask("points", HERE)) for _ in range(30)]
+    asked = [in_background(lambda: client.ask("points", MANY)) for _ in range(30)]
     until(lambda: client.stats().counters.get("queries.points.overloaded") == 26, "26 refusals")
     rig.mapper.queries.release()
     held()
@@ -70,17 +78,11 @@ def test_work_past_its_deadline_is_not_started(make_rig: MakeRig) -> None:
     rig = make_rig(queries__threads=1)
     client = rig.client()
     rig.mapper.queries.hold()
-    held = in_background(lambda: client.one("points", HERE))
+    held = in_background(lambda: client.one("points", MANY))
     rig.mapper.queries.wait_entered()
-    late = [
-        in_background(lambda: client.error("points", points_query([[0.0, 0, 0]], deadline_ms=1.0))),
-        in_background(
-            lambda: client.error(
-                "grid", messages.GridQuery(lower=[0.0] * 3, upper=[1.0] * 3, resolution=0.5, deadline_ms=1.0)
-            )
-        ),
-    ]
-    patient = in_background(lambda: client.one("points", points_query([[0.0, 0, 0]], deadline_ms=1e6)))
+    hurried = msgspec.structs.replace(MANY, deadline_ms=1.0)
+    late = [in_background(lambda: client.error("points", hurried)) for _ in range(2)]
+    patient = in_background(lambda: client.one("points", msgspec.structs.replace(MANY, deadline_ms=1e6)))
     until(lambda: client.stats().queues["queries.depth"] == 3, "three queries waiting")
     time.sleep(0.002)  # the deadline itself
     rig.mapper.queries.release()
@@ -104,7 +106,7 @@ def test_a_grid_stops_between_its_parts_at_the_deadline(
     client = rig.client()
     late_s = 0.0
     clock = types.SimpleNamespace(monotonic=lambda: time.monotonic() + late_s)
-    monkeypatch.setattr("potserver.adapters.queryable.time", clock)
+    monkeypatch.setattr("potserver.adapters.answers.time", clock)
     rig.mapper.queries.hold()
     asked = in_background(lambda: client.ask("grid", _grid_of_parts(deadline_ms=1e6)))
     rig.mapper.queries.wait_entered()
@@ -150,14 +152,13 @@ def test_info_does_not_wait_behind_grids(make_rig: MakeRig) -> None:
     rig = make_rig(queries__threads=1)
     client = rig.client()
     rig.mapper.queries.hold()
-    query = messages.GridQuery(lower=[0.0] * 3, upper=[2.0] * 3, resolution=0.5)
-    grids = [in_background(lambda: client.ask("grid", query)) for _ in range(3)]
+    grids = [in_background(lambda: client.ask("grid", _grid_of_parts())) for _ in range(3)]
     rig.mapper.queries.wait_entered()
     assert client.one("info").n_kernels == 0
     assert client.one("atoms").atoms == []
     rig.mapper.queries.release()
     for grid in grids:
-        assert len(grid()) == 1
+        assert len(grid()) == 4
 
 
 def test_a_query_over_the_byte_limit_of_zenoh_itself_is_no_answer_at_all(make_rig: MakeRig) -> None:
@@ -173,8 +174,9 @@ def test_a_query_over_the_byte_limit_of_zenoh_itself_is_no_answer_at_all(make_ri
 def test_what_changes_a_map_must_name_it(make_rig: MakeRig) -> None:
     rig = make_rig()
     client = rig.client()
-    (answer,) = client.get(f"{ROOT}/*/q/integrate", make_cloud(robot="r1"))
-    assert answer.code is ErrorCode.UNSUPPORTED
+    for key in (f"{ROOT}/*/in/r1/integrate", f"{ROOT}/default/in/*/integrate"):
+        (answer,) = client.get(key, make_cloud())
+        assert answer.code is ErrorCode.UNSUPPORTED
     (answer,) = client.get(f"{ROOT}/*/ctl/clear")
     assert answer.code is ErrorCode.UNSUPPORTED
     (answer,) = client.get(f"{ROOT}/*/q/info")
@@ -225,3 +227,56 @@ def test_a_client_killed_in_the_middle_of_a_query_does_no_harm(make_rig: MakeRig
     assert client.one("points", HERE).map_revision == 0
     assert client.one("integrate", make_cloud(robot="r1")).map_revision == 1
     assert rig.server.stop() is True
+
+
+def test_points_do_not_wait_behind_grids(make_rig: MakeRig) -> None:
+    """The mapper holds every grid; the points of another client, and of the same one, are answered meanwhile."""
+    rig = make_rig(queries__threads=1)
+    client = rig.client()
+    free = rig.mapper.snapshot.occupancy
+    rig.mapper.snapshot.occupancy = lambda points: free(points) if len(points) > 1 else _answer_of(rig)
+    rig.mapper.queries.hold()
+    grids = [in_background(lambda: client.ask("grid", _grid_of_parts())) for _ in range(3)]
+    rig.mapper.queries.wait_entered()
+    for asker in (client, rig.client()):
+        assert asker.one("points", HERE).map_revision == 0
+    rig.mapper.queries.release()
+    assert [len(grid()) for grid in grids] == [4, 4, 4]
+
+
+def _answer_of(rig: Any) -> Any:
+    return FakeSnapshot(FakeMapper(), KernelSet.empty(), 0).occupancy(np.zeros((1, 3)))
+
+
+def test_a_question_without_a_deadline_has_the_default_one(make_rig: MakeRig) -> None:
+    rig = make_rig(queries__deadline_s=1e-9)
+    client = rig.client()
+    error = client.error("points", HERE)
+    assert (error.code, error.retryable) == (ErrorCode.DEADLINE, True)
+    assert client.one("points", points_query([[0.0, 0, 0]], deadline_ms=1e6)).map_revision == 0
+
+
+def test_a_client_that_is_killed_leaves_no_work_behind(make_rig: MakeRig) -> None:
+    """Its grids are given up when its connection ends, those that wait and the one in work."""
+    rig = make_rig(queries__threads=1)
+    rig.mapper.queries.hold()
+    script = (
+        "import sys, threading\n"
+        "from potclient import MapClient\n"
+        "client = MapClient(sys.argv[1], timeout_s=600)\n"
+        "client.wait_ready(30)\n"
+        "for _ in range(5): threading.Thread(target=client.grid, args=((0, 0, 0), (32, 32, 32), 0.5)).start()\n"
+    )
+    victim = subprocess.Popen([sys.executable, "-c", script, rig.server.endpoint])
+    try:
+        rig.mapper.queries.wait_entered()
+        until(lambda: rig.server.pool.depth == 4, "four grids waiting")
+    finally:
+        victim.kill()
+        victim.wait(DEADLINE_S)
+    counters = rig.server.health.counters
+    until(lambda: counters().get("queries.grid.asker_gone") == 4, "those that wait to be given up")
+    rig.mapper.queries.release()
+    until(lambda: counters().get("queries.grid.asker_gone") == 5, "the one in work to be given up")
+    assert rig.mapper.queries.entered.qsize() == 0, "no further part was computed"
+    assert rig.client().one("points", HERE).map_revision == 0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -68,7 +69,7 @@ def test_a_map_is_there_after_a_restart_and_old_clouds_are_known(serve: Serve) -
     info = client.one("info")
     assert (info.n_scans, info.map_revision) == (2, 2)
     assert client.one("points", HERE).mean.data == before.mean.data, "the very same answers"
-    assert client.error("integrate", make_cloud(seq=2, robot="r1")).code is ErrorCode.OLD_STAMP
+    assert client.error("integrate", make_cloud(seq=2, robot="r1")).code is ErrorCode.OLD_SEQ
     assert client.one("integrate", make_cloud(seq=3, robot="r1")).map_revision == 3
 
 
@@ -91,11 +92,63 @@ def test_save_load_and_clear_over_the_wire(serve: Serve) -> None:
     assert len(told[3].changed_tiles) > 0
     assert told[3].n_kernels == client.one("info").n_kernels
     assert client.one("integrate", make_cloud(seq=2, robot="r1")).map_revision == 5, (
-        "stamps are the saved map's"
+        "numbers are the saved map's"
     )
-    assert client.error("integrate", make_cloud(seq=1, robot="r1")).code is ErrorCode.OLD_STAMP
+    assert client.error("integrate", make_cloud(seq=1, robot="r1")).code is ErrorCode.OLD_SEQ
     counters = client.stats().counters
     assert (counters["maps.loaded"], counters["control.load.unknown_map"]) == (1, 1)
+
+
+def test_a_backup_by_save_is_complete_and_comes_back_on_another_server(serve: Serve, tmp_path: Path) -> None:
+    server, client = serve()
+    for seq in (1, 2):
+        client.one("integrate", make_cloud(seq=seq, robot="r1"))
+    client.control("save", named("nightly"))  # while it serves: complete as of this moment
+    before = client.one("points", HERE)
+    (file,) = (tmp_path / "store" / "saved").rglob("nightly.map")
+    shutil.copy(file, tmp_path / "backup.map")
+    client.one("integrate", make_cloud(seq=3, robot="r1"))
+    client.close()
+    assert server.stop()
+    shutil.rmtree(tmp_path / "store")  # the disk is lost
+    _, client = serve()
+    client.control("save", named("nightly"))
+    (place,) = (tmp_path / "store" / "saved").rglob("nightly.map")
+    shutil.copy(tmp_path / "backup.map", place)
+    client.control("load", named("nightly"))
+    assert client.one("info").n_scans == 2
+    assert client.one("points", HERE).mean.data == before.mean.data
+    assert client.error("integrate", make_cloud(seq=2, robot="r1")).code is ErrorCode.OLD_SEQ
+    client.one("integrate", make_cloud(seq=3, robot="r1"))  # the robot sends again what came after
+
+
+def test_a_full_map_takes_no_cloud_until_there_is_room(serve: Serve) -> None:
+    _, client = serve(limits__max_map_bytes=1)
+    receipts = client.receipts("r2")
+    client.one("integrate", make_cloud(seq=1, robot="r1"))
+    client.put_cloud(make_cloud(seq=1), robot="r2")
+    (refused,) = drain(receipts, 1)
+    assert (refused.status.value, refused.reason) == ("rejected", "map_full")
+    assert "limits.max_map_bytes" in refused.message
+    client.control("clear")
+    client.put_cloud(make_cloud(seq=2), robot="r2")
+    (taken,) = drain(receipts, 1)
+    assert taken.status.value == "accepted"
+
+
+def test_copies_belong_to_their_map(serve: Serve, tmp_path: Path) -> None:
+    server, ground = serve(maps=["ground", "roof"])
+    ground.close()
+    with contextlib.closing(Client(server.endpoint, map_id="ground")) as ground:
+        ground.control("save", named("copy"))
+    saved = tmp_path / "store" / "saved"
+    assert [path.relative_to(saved).as_posix() for path in saved.rglob("*.map")] == ["ground/copy.map"]
+    with contextlib.closing(Client(server.endpoint, map_id="roof")) as roof:
+        assert roof.control("load", named("copy")).code is ErrorCode.UNKNOWN_MAP
+        (saved / "ground" / "copy.map").rename(saved / "copy.map")  # where all maps had their copies before
+        error = roof.control("load", named("copy"))
+        assert error.code is ErrorCode.UNKNOWN_MAP
+        assert f"move it to {saved / 'roof' / 'copy.map'}" in error.message
 
 
 def test_names_where_they_belong_and_nowhere_else(serve: Serve) -> None:
@@ -135,6 +188,10 @@ def test_maps_merge_and_robots_are_forgotten_over_the_wire(serve: Serve) -> None
     assert client.one("info").n_kernels == pytest.approx(alone.n_kernels, rel=0.02)
     assert client.control("forget", messages.ControlRequest(robot="r3")).code is ErrorCode.UNKNOWN_ROBOT
     assert client.control("merge", named("ours")).code is ErrorCode.UNKNOWN_MAP
+    far = np.eye(4)
+    far[1, 3] = 3e10
+    beyond = messages.ControlRequest(name="theirs", T_map_saved=wire.encode_array(far))
+    assert client.control("merge", beyond).code is ErrorCode.OUT_OF_RANGE
     skewed = messages.ControlRequest(name="theirs", T_map_saved=wire.encode_array(2.0 * pose))
     assert client.control("merge", skewed).code is ErrorCode.BAD_POSE
     counters = client.stats().counters
@@ -154,9 +211,8 @@ def test_what_was_merged_and_forgotten_is_so_after_a_restart(serve: Serve) -> No
     assert server.stop()
     _, client = serve()
     assert client.one("points", HERE).mean.data == before.mean.data
-    assert client.control("forget", messages.ControlRequest(robot="r2")).verb == "forget", (
-        "nothing is left to change"
-    )
+    again = client.control("forget", messages.ControlRequest(robot="r2"))
+    assert (again.code, "scans from r1" in again.message) == (ErrorCode.UNKNOWN_ROBOT, True)
 
 
 def test_a_cloud_that_the_disk_refuses_is_dropped_with_that_reason(serve: Serve) -> None:
@@ -196,6 +252,32 @@ def test_a_damaged_store_is_an_error_and_not_an_empty_map(serve: Serve, tmp_path
     file.write_bytes(content)
     with pytest.raises(MapFileError, match="is damaged"):
         serve()
+
+
+def test_a_read_only_server_answers_and_takes_nothing_in(serve: Serve) -> None:
+    server, client = serve()
+    client.one("integrate", make_cloud(seq=1, robot="r1"))
+    client.control("save", named("one"))
+    before = client.one("points", HERE)
+    client.close()
+    assert server.stop()
+    server, client = serve(store__read_only=True)
+    receipts = client.receipts("r1")
+    assert client.one("points", HERE).mean.data == before.mean.data
+    assert client.one("info").durable is False
+    assert client.error("integrate", make_cloud(seq=2, robot="r1")).code is ErrorCode.READ_ONLY
+    client.put_cloud(make_cloud(seq=3, robot="r1"))
+    (receipt,) = drain(receipts, 1)
+    assert (receipt.status.value, receipt.reason) == ("rejected", "read_only")
+    for verb, request in (
+        ("clear", messages.ControlRequest()),
+        ("save", messages.ControlRequest()),
+        ("load", named("one")),
+    ):
+        assert client.control(verb, request).code is ErrorCode.READ_ONLY
+    assert client.one("points", HERE).mean.data == before.mean.data
+    client.close()
+    assert server.stop()
 
 
 def test_in_memory_there_is_nothing_to_save(serve: Serve) -> None:

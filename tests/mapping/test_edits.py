@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from potserver.domain.dictionary import AtomDictionary
+from potserver.domain.tiles import TiledMap, TileGrid
 from potserver.domain.types import Float64, Occupancy, Scan, yaw_pose
-from potserver.errors import BadPoseError, SettingsError, UnknownRobotError, UnsupportedError
+from potserver.errors import BadPoseError, MapFullError, SettingsError, UnknownRobotError, UnsupportedError
 from potserver.mapping.default import DefaultPipeline
 from potserver.mapping.pipeline import Method
 from potserver.mapping.service import MappingService, pipeline_of
@@ -157,6 +158,28 @@ def test_a_robot_is_taken_out_again() -> None:
     weight = [t.rows.sums[:, 3].astype(float).sum() for t in service.state.tiled.tiles.values()]
     expected = [t.rows.sums[:, 3].astype(float).sum() for t in alone.state.tiled.tiles.values()]
     assert sum(weight) == pytest.approx(sum(expected), rel=1e-6)
+
+
+def test_the_number_of_a_robot_that_was_taken_out_is_given_again() -> None:
+    service = _fed(_scan(0, "a"), _scan(1, "b"), _scan(2, "c"))
+    service.remove_robot("b")
+    with pytest.raises(UnknownRobotError, match="from a, c"):
+        service.remove_robot("b")
+    service.integrate(_scan(3, "d"))
+    assert service.state.tiled.robots == ("a", "d", "c")
+    service.remove_robot("d")
+    merged = _fed(_scan(4, "e"))
+    merged.merge(service.state, np.eye(4))
+    assert merged.state.tiled.robots == ("e", "a", "c"), "nobody's number is nobody's elsewhere"
+
+
+def test_a_map_has_numbers_for_so_many_robots_and_then_says_so() -> None:
+    names = tuple(f"r{n}" for n in range(2**15))
+    full = TiledMap.empty(TileGrid(10.0, 0.5))._replace(robots=names)
+    assert full.with_robot("r5")[1] == 5
+    with pytest.raises(MapFullError, match="forget one"):
+        full.with_robot("one-more")
+    assert full.without_robot(7).with_robot("one-more")[1] == 7
 
 
 def test_who_was_never_there_cannot_be_taken_out() -> None:

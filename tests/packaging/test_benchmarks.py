@@ -10,7 +10,19 @@ import pytest
 
 
 @pytest.mark.parametrize(
-    "name", ["equal_time", "ghosts", "kill", "laps", "lattices", "learner_curves", "mirror"]
+    "name",
+    [
+        "equal_time",
+        "fairness",
+        "ghosts",
+        "kill",
+        "laps",
+        "lattices",
+        "learner_curves",
+        "mirror",
+        "sessions",
+        "torture",
+    ],
 )
 def test_a_benchmark_tells_its_flags(root: Path, name: str) -> None:
     run = subprocess.run(

@@ -22,6 +22,7 @@ KEYS = MapKeys(DEFAULT_ROOT, "site")
 def test_keys_are_the_contract() -> None:
     assert KEYS.cloud("r1") == "pot/v1/site/in/r1/cloud"
     assert KEYS.pose("r1") == "pot/v1/site/in/r1/pose"
+    assert KEYS.integrate("r1") == "pot/v1/site/in/r1/integrate"
     assert KEYS.receipt("r1") == "pot/v1/site/out/r1/receipt"
     assert KEYS.params("r1") == "pot/v1/site/out/r1/params"
     assert KEYS.revision == "pot/v1/site/ev/revision"
@@ -77,7 +78,7 @@ def test_a_root_that_no_key_can_start_with_is_refused(root: str) -> None:
 @pytest.mark.parametrize("robot", ["r1", "in", "cloud", "Not An Id"])
 def test_the_robot_is_read_back_from_its_keys(root: str, robot: str) -> None:
     keys = MapKeys(root, "m")
-    for build in (keys.cloud, keys.pose, keys.receipt, keys.params, keys.robot_token):
+    for build in (keys.cloud, keys.pose, keys.integrate, keys.receipt, keys.params, keys.robot_token):
         assert robot_of(build(robot)) == robot
 
 

@@ -109,7 +109,7 @@ def test_a_field_that_was_added_later_is_left_out_of_the_bytes_and_shown_with_an
         for field in msgspec.structs.fields(type(m))
         if field.default is messages.ABSENT and getattr(m, field.name) is messages.ABSENT
     }
-    assert len(later) == 11
+    assert len(later) == 13
     assert not any(later.values())
     given = {
         type(m) for m in examples().values() for kind, name in later if type(m) is kind and getattr(m, name)
@@ -166,14 +166,15 @@ def test_the_readme_has_every_key(readme: str) -> None:
     expected = {
         site.cloud("<robot>"),
         site.pose("<robot>"),
+        site.integrate("<robot>"),
         site.receipt("<robot>"),
         site.params("<robot>"),
         site.revision,
         site.robot_token("<robot>"),
         site.server_token("<server>"),
         keys.stats_key(keys.DEFAULT_ROOT, "<server>"),
-        *(site.query(op) for op in ("integrate", *QUESTIONS)),
-        *(site.control(verb) for verb in keys.CONTROL_VERBS),
+        *(site.query(op) for op in QUESTIONS),
+        *(site.control(verb) for verb in (*keys.CONTROL_VERBS, keys.CHANGE_ATOMS)),
     }
     table = readme.split("## Keys")[1].split("\n## ")[0]
     assert set(re.findall(r"^\| `(@?pot/[^`]+)` \|", table, re.MULTILINE)) == expected
@@ -194,6 +195,7 @@ def test_the_readme_has_the_limits_as_they_are(readme: str) -> None:
     values = [int(value) for value in re.findall(r"^\| [^|]+ \| (\d+)", table, re.MULTILINE)]
     assert values == [
         *wire.DEFAULT_LIMITS,
+        wire.MAX_REQUEST_VALUES,
         wire.MAX_STRING_BYTES,
         messages.MAX_AXES,
         messages.MAX_AXIS_LENGTH,

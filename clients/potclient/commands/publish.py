@@ -115,8 +115,9 @@ def _add_sending(parser: argparse.ArgumentParser) -> None:
         help="send each scan as a query and wait until it is in the map",
     )
     parser.add_argument(
-        "--keep-stamps", action="store_true", help="send the recorded stamps instead of the current time"
-    )
+        "--keep-stamps", action="store_true",
+        help="send the recorded stamps, not the current time; a second round of the recording is then refused",
+    )  # fmt: skip
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -1,30 +1,33 @@
-"""`q/atoms`: the server's dictionary, read and changed."""
+"""`q/atoms` and `ctl/atoms`: the server's dictionary, read and changed."""
 
 from __future__ import annotations
 
 from potclient.atoms import Atom
 from potclient.link import Link
+from potschemas.keys import CHANGE_ATOMS
 from potschemas.messages import Atom as AtomMessage
 from potschemas.messages import AtomInfo, AtomList, AtomsAction, AtomsChanged, AtomsQuery
 
 
 def atoms(link: Link, timeout_s: float | None) -> list[AtomInfo]:
     """See `MapClient.atoms`."""
-    return link.ask("atoms", AtomsQuery(), AtomList, timeout_s).atoms
+    return link.ask(link.keys.query("atoms"), AtomsQuery(), AtomList, timeout_s).atoms
 
 
 def atom(link: Link, atom_id: str, timeout_s: float | None) -> Atom:
     """See `MapClient.atom`."""
-    return Atom.from_message(link.ask("atoms", AtomsQuery(atom_id=atom_id), AtomMessage, timeout_s))
+    return Atom.from_message(
+        link.ask(link.keys.query("atoms"), AtomsQuery(atom_id=atom_id), AtomMessage, timeout_s)
+    )
 
 
 def add_atom(link: Link, new: Atom, timeout_s: float | None) -> AtomsChanged:
     """See `MapClient.add_atom`."""
     query = AtomsQuery(action=AtomsAction.ADD, atom=new.to_message())
-    return link.ask("atoms", query, AtomsChanged, timeout_s)
+    return link.ask(link.keys.control(CHANGE_ATOMS), query, AtomsChanged, timeout_s)
 
 
 def remove_atom(link: Link, atom_id: str, timeout_s: float | None) -> AtomsChanged:
     """See `MapClient.remove_atom`."""
     query = AtomsQuery(action=AtomsAction.REMOVE, atom_id=atom_id)
-    return link.ask("atoms", query, AtomsChanged, timeout_s)
+    return link.ask(link.keys.control(CHANGE_ATOMS), query, AtomsChanged, timeout_s)

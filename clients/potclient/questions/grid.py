@@ -42,7 +42,7 @@ def grid(
     )
     assembly: _Assembly | None = None
     cells = np.ceil((upper_m - lower_m) / resolution - 1e-6)
-    for part in link.stream("grid", request, messages.GridPart, timeout_s):
+    for part in link.stream(link.keys.query("grid"), request, messages.GridPart, timeout_s):
         if assembly is None:
             if np.abs(np.asarray(part.shape) - cells).max() > 1:
                 raise BadReplyError(

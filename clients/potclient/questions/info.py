@@ -10,7 +10,7 @@ from potschemas.keys import stats_key
 
 def info(link: Link, timeout_s: float | None = None) -> messages.Info:
     """See `MapClient.info`."""
-    return link.ask("info", messages.InfoQuery(), messages.Info, timeout_s)
+    return link.ask(link.keys.query("info"), messages.InfoQuery(), messages.Info, timeout_s)
 
 
 def stats(link: Link, server: str | None, timeout_s: float | None) -> messages.Stats:

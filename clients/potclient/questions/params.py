@@ -25,7 +25,7 @@ def params_parts(
         deadline_ms=link.deadline_ms(timeout_s),
     )
     parts = PartCheck("params")
-    for part in link.stream("params", request, messages.ParamsPart, timeout_s):
+    for part in link.stream(link.keys.query("params"), request, messages.ParamsPart, timeout_s):
         parts.add(part.part, part.n_parts, map_revision=part.map_revision)
         yield (
             part.part,

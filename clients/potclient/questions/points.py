@@ -75,7 +75,7 @@ class PointsQuestion:
             deadline_ms=self._link.deadline_ms(timeout_s),
             with_gradient=True if with_gradient else messages.ABSENT,
         )
-        return self._link.stream("points", request, messages.Occupancy, timeout_s)
+        return self._link.stream(self._link.keys.query("points"), request, messages.Occupancy, timeout_s)
 
     def _points_a_question(self, bytes_a_point: int) -> int:
         if self.limits is None:

@@ -112,7 +112,7 @@ def rays(
             directions=encode_array(ways[run].astype(np.float32)),
         )
         try:
-            reply = link.ask("rays", request, messages.Rays, timeout_s)
+            reply = link.ask(link.keys.query("rays"), request, messages.Rays, timeout_s)
         except TooLargeError:
             if n <= 1:
                 raise

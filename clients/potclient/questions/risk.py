@@ -78,4 +78,4 @@ def risk(
         dims=dims,
         deadline_ms=link.deadline_ms(timeout_s),
     )
-    return Risk.from_message(link.ask("risk", request, messages.Risk, timeout_s), len(poses))
+    return Risk.from_message(link.ask(link.keys.query("risk"), request, messages.Risk, timeout_s), len(poses))

@@ -1,52 +1,70 @@
-"""`q/atoms`: list the dictionary, fetch one atom whole, or change the dictionary."""
+"""`q/atoms`: list the dictionary, or fetch one atom whole. `ctl/atoms`: change the dictionary."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 from potschemas import messages
 from potschemas.messages import AtomsAction
-from potserver.adapters.questions.question import Asked, Question, Served
+from potserver.adapters.questions.question import Asked, Question, Single, the_part
 from potserver.codec.atoms import decode_atom, encode_atom, encode_atom_info
-from potserver.errors import BadMessageError, PotserverError
-from potserver.log import get_logger
-
-log = get_logger("potserver.queries")
+from potserver.errors import BadMessageError, PotserverError, UnsupportedError
 
 
-def action_of(query: messages.AtomsQuery) -> AtomsAction:
-    """What is asked for.
+def check_reads(query: messages.AtomsQuery) -> None:
+    """Refuse what does not only read.
 
     Raises:
-        BadMessageError: the other fields do not fit the action.
+        UnsupportedError: it asks for a change. BadMessageError: it brings an atom.
     """
-    action = AtomsAction.READ if query.action is messages.ABSENT else query.action
-    if action is AtomsAction.ADD:
+    if query.action not in (messages.ABSENT, AtomsAction.READ):
+        raise UnsupportedError(
+            f"q/atoms only reads: to {query.action.value} an atom, ask ctl/atoms, which is for operators"
+        )
+    if query.atom is not messages.ABSENT:
+        raise BadMessageError("pot.atoms_query.v1: to read takes no field `atom`")
+
+
+def check_changes(query: messages.AtomsQuery) -> None:
+    """Refuse what is no change, or not a whole one.
+
+    Raises:
+        UnsupportedError: it only reads. BadMessageError: the other fields do not fit the action.
+    """
+    if query.action in (messages.ABSENT, AtomsAction.READ):
+        raise UnsupportedError(
+            "ctl/atoms changes the dictionary (`action` add or remove): to read it, ask q/atoms"
+        )
+    if query.action is AtomsAction.ADD:
         if query.atom is messages.ABSENT or query.atom_id not in (None, query.atom.info.atom_id):
             raise BadMessageError(
                 "pot.atoms_query.v1: to add needs the field `atom`, and no other id beside it"
             )
     elif query.atom is not messages.ABSENT:
-        raise BadMessageError(f"pot.atoms_query.v1: to {action.value} takes no field `atom`")
-    elif action is AtomsAction.REMOVE and query.atom_id is None:
+        raise BadMessageError("pot.atoms_query.v1: to remove takes no field `atom`")
+    elif query.atom_id is None:
         raise BadMessageError("pot.atoms_query.v1: to remove needs the field `atom_id`")
-    return action
 
 
-def _answer(asked: Asked, query: messages.AtomsQuery) -> Iterator[messages.Message]:
-    if action_of(query) is not AtomsAction.READ:
-        yield _changed(asked.served, query)
-        return
+def _plan_read(asked: Asked, query: messages.AtomsQuery) -> Single:
+    check_reads(query)
     mapper = asked.served.mapper
     dictionary, usage = mapper.dictionary, mapper.atom_usage
-    if query.atom_id is None:
-        yield messages.AtomList(atoms=[encode_atom_info(atom, usage) for atom in dictionary])
-    else:
-        yield encode_atom(dictionary.get(query.atom_id), usage, asked.snapshot.rule)
+    atom_id = query.atom_id
+    if atom_id is None:
+        return Single(
+            lambda: messages.AtomList(atoms=[encode_atom_info(atom, usage) for atom in dictionary]),
+            is_short=True,
+        )
+    return Single(lambda: encode_atom(dictionary.get(atom_id), usage, asked.snapshot.rule), is_short=True)
 
 
-def _changed(served: Served, query: messages.AtomsQuery) -> messages.AtomsChanged:
+def _plan_change(asked: Asked, query: messages.AtomsQuery) -> Single:
+    check_changes(query)
+    return Single(lambda: _change(asked, query), is_short=False)
+
+
+def _change(asked: Asked, query: messages.AtomsQuery) -> messages.AtomsChanged:
     """Add or remove an atom, and count what became of it."""
+    served = asked.served
     if query.atom is not messages.ABSENT:
         atom = decode_atom(query.atom, max_points=served.limits.max_query_points)
         verb, change_dictionary = "added", lambda: served.atoms.add(atom)
@@ -58,9 +76,10 @@ def _changed(served: Served, query: messages.AtomsQuery) -> messages.AtomsChange
         served.health.count(f"atoms.refused.{error.reason or error.code}")
         raise
     served.health.count(f"atoms.{verb}")
-    log.info(f"atom_{verb}", **change._asdict())
+    served.audit.changed("control.atoms", asked.asker, result=verb, **change._asdict())
     return messages.AtomsChanged(**change._asdict())
 
 
-# a change of the dictionary is rare, and short beside a grid
-QUESTION = Question(op="atoms", query=messages.AtomsQuery, answer=_answer, is_short=True)
+QUESTION = Question(op="atoms", query=messages.AtomsQuery, plan=_plan_read, each=the_part)
+# the newcomer is compared with the whole dictionary
+CHANGE = Question(op="atoms", query=messages.AtomsQuery, plan=_plan_change, each=the_part, is_quick=False)

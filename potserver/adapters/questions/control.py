@@ -1,4 +1,4 @@
-"""`ctl/<verb>` of one map. Each follows every cloud that was admitted before it."""
+"""`ctl/<verb>` of one map. Each follows every cloud that was admitted before it; `ctl/atoms` is of the dictionary."""
 
 from __future__ import annotations
 
@@ -10,12 +10,14 @@ import numpy as np
 import zenoh
 
 from potschemas import keys, messages
+from potserver.adapters.answers import Answers
 from potserver.adapters.intake import Barrier, IntakeQueue
 from potserver.adapters.key_exprs import is_wild, last_chunk
 from potserver.adapters.outbox import Outbox
 from potserver.adapters.queryable import Queryable
+from potserver.adapters.questions import atoms
 from potserver.adapters.questions.question import Served
-from potserver.adapters.replies import BUG, check_query, payload_of, reply, reply_error
+from potserver.adapters.replies import BUG, asker_of, check_query, payload_of, reply, reply_error
 from potserver.adapters.writer import MapWriter
 from potserver.codec.base import decode, encode
 from potserver.codec.clouds import decode_transform
@@ -77,6 +79,9 @@ VERBS = {
 }
 
 
+_ALL = (*VERBS, keys.CHANGE_ATOMS)
+
+
 def work_of(verb: str, request: messages.ControlRequest, writer: MapWriter) -> Work:
     """What the writer's thread shall do.
 
@@ -102,6 +107,7 @@ class ControlQueryable(Queryable):
         map_keys: keys.MapKeys,
         *,
         served: Served,
+        answers: Answers,
         intake: IntakeQueue,
         writer: MapWriter,
         withdraw: Callable[[], None],
@@ -112,12 +118,14 @@ class ControlQueryable(Queryable):
         Args:
             session, map_keys: Where.
             served: The map.
+            answers: `ctl/atoms`, which is about the dictionary and waits for no clouds.
             intake: Where the work waits for the clouds before it.
             writer: Whose thread does it.
             withdraw: Says that the map takes no more clouds.
             prompt: Sends the replies.
         """
-        self._keys, self._served, self._intake, self._writer = map_keys, served, intake, writer
+        self._keys, self._served, self._answers = map_keys, served, answers
+        self._intake, self._writer = intake, writer
         self._withdraw, self._prompt = withdraw, prompt
         super().__init__(session, map_keys.control("*"))
 
@@ -128,8 +136,11 @@ class ControlQueryable(Queryable):
             raise UnsupportedError(
                 "control changes a map: name the map and the verb, wildcards are not taken"
             )
+        if verb == keys.CHANGE_ATOMS:
+            self._answers.submit(query, atoms.CHANGE, self._keys.control(verb), "control.atoms")
+            return
         if verb not in VERBS:
-            raise UnsupportedError(f"no verb {verb!r}; there are {', '.join(VERBS)}")
+            raise UnsupportedError(f"no verb {verb!r}; there are {', '.join(_ALL)}")
         check_query(query, messages.ControlRequest, self._served.limits.max_query_bytes, "control request")
         request = decode(payload_of(query), messages.ControlRequest)
         deadline_s = None if request.timeout_s is None else time.monotonic() + request.timeout_s
@@ -141,7 +152,9 @@ class ControlQueryable(Queryable):
                     raise DeadlineError(
                         f"{verb}: {request.timeout_s} s passed before the clouds ahead of it were mapped"
                     )
-                self._done(query, verb, work())
+                message = work()
+                self._served.audit.changed(f"control.{verb}", asker_of(query), result=message)
+                self._done(query, verb, message)
             except PotserverError as error:
                 self.refuse(query, error)
             except Exception:
@@ -172,7 +185,9 @@ class ControlQueryable(Queryable):
     def refuse(self, query: zenoh.Query, error: PotserverError) -> None:
         """Count what is wrong; the outbox sends it."""
         verb = last_chunk(query.key_expr)
-        self._served.health.count(f"control.{verb if verb in VERBS else 'unknown'}.{error.code}")
+        name = f"control.{verb if verb in _ALL else 'unknown'}"
+        self._served.health.count(f"{name}.{error.code}")
+        self._served.audit.refused(name, asker_of(query), error)
 
         def send() -> None:
             with query:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 from potschemas import messages
 from potserver.adapters.questions.question import Asked, Question
 from potserver.asking.grid import Grid, GridPlan, GridRun
@@ -13,10 +11,8 @@ from potserver.domain.kernel_map import KernelMap
 from potserver.limits import Limits
 
 
-def _answer(asked: Asked, query: messages.GridQuery) -> Iterator[messages.Message]:
-    plan = Grid(query.lower, query.upper, query.resolution).plan(asked.snapshot, asked.limits)
-    for number, run in enumerate(asked.parts(plan)):
-        yield encode_part(plan, number, run)
+def _plan(asked: Asked, query: messages.GridQuery) -> GridPlan:
+    return Grid(query.lower, query.upper, query.resolution).plan(asked.snapshot, asked.limits)
 
 
 def encode_part(plan: GridPlan, number: int, run: GridRun) -> messages.GridPart:
@@ -37,5 +33,10 @@ def _warm_up(kernels: KernelMap) -> None:
 
 
 QUESTION = Question(
-    op="grid", query=messages.GridQuery, answer=_answer, max_bytes=MAX_SMALL_BYTES, warm_up=_warm_up
+    op="grid",
+    query=messages.GridQuery,
+    plan=_plan,
+    each=encode_part,
+    max_bytes=MAX_SMALL_BYTES,
+    warm_up=_warm_up,
 )

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import Any
 
 from potschemas import __version__, messages
-from potserver.adapters.questions.question import Asked, Question
+from potserver.adapters.questions.question import Asked, Question, Single, the_part
 from potserver.codec.base import MAX_SMALL_BYTES
 from potserver.domain.kernel_map import KernelMap
 from potserver.limits import Limits
@@ -30,9 +29,9 @@ def encode_limits(limits: Limits, *, max_range_m: float) -> messages.Limits:
     return messages.Limits(max_range_m=max_range_m, **{name: getattr(limits, name) for name in names})
 
 
-def _answer(asked: Asked, _query: messages.InfoQuery) -> Iterator[messages.Message]:
+def _encode(asked: Asked) -> messages.Info:
     served, mapper = asked.served, asked.served.mapper
-    yield messages.Info(
+    return messages.Info(
         server=served.server_id,
         version=__version__,
         map=served.map_id,
@@ -48,6 +47,8 @@ def _answer(asked: Asked, _query: messages.InfoQuery) -> Iterator[messages.Messa
     )
 
 
-QUESTION = Question(
-    op="info", query=messages.InfoQuery, answer=_answer, is_short=True, max_bytes=MAX_SMALL_BYTES
-)
+def _plan(asked: Asked, _query: messages.InfoQuery) -> Single:
+    return Single(lambda: _encode(asked), is_short=True)
+
+
+QUESTION = Question(op="info", query=messages.InfoQuery, plan=_plan, each=the_part, max_bytes=MAX_SMALL_BYTES)

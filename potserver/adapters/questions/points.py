@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 from potschemas import messages
 from potserver.adapters.questions.question import Asked, Question
-from potserver.asking.points import Points
+from potserver.asking.points import Points, PointsPlan
 from potserver.codec.base import FLOATS, decode_array
 from potserver.codec.occupancy import encode_occupancy
 from potserver.domain.kernel_map import KernelMap
+from potserver.domain.types import Occupancy
 from potserver.limits import Limits
 
 
@@ -23,14 +22,16 @@ def decode_points(query: messages.PointsQuery) -> Points:
     return Points(points, with_gradient=query.with_gradient is True)
 
 
-def _answer(asked: Asked, query: messages.PointsQuery) -> Iterator[messages.Message]:
-    plan = decode_points(query).plan(asked.snapshot, asked.limits)
-    for occupancy in asked.parts(plan):
-        yield encode_occupancy(occupancy)
+def _plan(asked: Asked, query: messages.PointsQuery) -> PointsPlan:
+    return decode_points(query).plan(asked.snapshot, asked.limits)
+
+
+def _encode(plan: PointsPlan, parts: list[Occupancy]) -> messages.Occupancy:
+    return encode_occupancy(plan.result(parts))
 
 
 def _warm_up(kernels: KernelMap) -> None:
     Points([[0.0, 0.0, 0.0]], with_gradient=True).plan(kernels, Limits()).part(0)
 
 
-QUESTION = Question(op="points", query=messages.PointsQuery, answer=_answer, warm_up=_warm_up)
+QUESTION = Question(op="points", query=messages.PointsQuery, plan=_plan, whole=_encode, warm_up=_warm_up)

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Iterator
-from typing import Generic, TypeVar
+from typing import Any, Generic, NamedTuple, TypeVar
+
+import numpy as np
 
 from potschemas import messages
+from potserver.adapters.audit import Audit
 from potserver.asking.plan import Plan
 from potserver.atoms.store import AtomStore
 from potserver.domain.kernel_map import KernelMap
@@ -15,7 +18,6 @@ from potserver.health import Health
 from potserver.limits import Limits
 from potserver.mapping.service import MappingService
 
-PartT = TypeVar("PartT")
 QueryT = TypeVar("QueryT", bound=messages.Message)
 
 
@@ -29,6 +31,7 @@ class Served:
     mapper: MappingService
     atoms: AtomStore
     health: Health
+    audit: Audit
     limits: Limits
     durable: bool  # accepted clouds survive a crash
 
@@ -39,6 +42,7 @@ class Asked:
 
     served: Served
     state: MapState
+    asker: str  # who asks, as far as the query says so
     check_may_go_on: Callable[[], None]  # raises when the asker or the server waits no longer
 
     @property
@@ -51,24 +55,79 @@ class Asked:
         """What the question is checked against."""
         return self.served.limits
 
-    def parts(self, plan: Plan[PartT]) -> Iterator[PartT]:
-        """The parts of a plan, as long as the answer may go on.
 
-        Raises:
-            DeadlineError: the asker waits no longer. ShuttingDownError: nor does the server.
-        """
-        for i in range(plan.n_parts):
-            self.check_may_go_on()
-            yield plan.part(i)
+class Step(NamedTuple):
+    """One bounded piece of the work on an answer; others may have their turn after it."""
+
+    reply: messages.Message | None  # to be sent now
+    rest_is_short: bool | None  # None: that was all
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Question(Generic[QueryT]):
-    """One kind of question, `q/<op>`."""
+    """One kind of question, `q/<op>`: its plan, and the messages that are made of the plan's parts."""
 
     op: str
     query: type[QueryT]  # the message that asks; its `deadline_ms`, if it has one, is kept
-    answer: Callable[[Asked, QueryT], Iterator[messages.Message]]  # yields the replies
-    is_short: bool = False  # microseconds of work: answered past long questions that wait
+    plan: Callable[[Asked, QueryT], Plan[Any]]  # decodes and checks the question
+    each: Callable[[Any, int, Any], messages.Message] | None = None  # (plan, number, part): a reply a part
+    whole: Callable[[Any, list[Any]], messages.Message] | None = None  # (plan, parts): one reply of all parts
+    is_quick: bool = True  # to plan: the worker of short questions may look whether this is one
     max_bytes: int | None = None  # of the query; None = `Limits.max_query_bytes`
     warm_up: Callable[[KernelMap], object] | None = None  # compiles what the answer uses, on a small map
+
+    def steps(self, asked: Asked, query: QueryT) -> Iterator[Step]:
+        """Answer, step by step: the plan, and each of its parts.
+
+        Raises:
+            PotserverError: the question is refused, or nobody waits for it any longer.
+        """
+        # hostile numbers may overflow; the checks see the infinity, the log needs no warning
+        with np.errstate(over="ignore"):
+            plan = self.plan(asked, query)
+            is_short = plan.is_short
+        yield Step(None, is_short)
+        parts = []
+        for number in range(plan.n_parts):
+            asked.check_may_go_on()
+            with np.errstate(over="ignore"):
+                part = plan.part(number)
+                reply = None if self.each is None else self.each(plan, number, part)
+            if self.whole is not None:
+                parts.append(part)
+            is_last = number + 1 == plan.n_parts and self.whole is None
+            yield Step(reply, None if is_last else is_short)
+        if self.whole is not None:
+            with np.errstate(over="ignore"):
+                reply = self.whole(plan, parts)
+            yield Step(reply, None)
+
+
+class Single(Plan[messages.Message]):
+    """An answer in one piece: one message.
+
+    Args:
+        make: The work.
+        is_short: Whether it takes about a millisecond.
+    """
+
+    __slots__ = ("_is_short", "_make")
+    part_size = 1
+    n_items = 1
+
+    def __init__(self, make: Callable[[], messages.Message], *, is_short: bool) -> None:
+        self._make, self._is_short = make, is_short
+
+    @property
+    def is_short(self) -> bool:
+        """As it was said."""
+        return self._is_short
+
+    def part(self, i: int) -> messages.Message:
+        """The answer."""
+        return self._make()
+
+
+def the_part(_plan: Plan[Any], _number: int, part: messages.Message) -> messages.Message:
+    """The reply of a `Single` plan."""
+    return part

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 from potschemas import messages
 from potserver.adapters.questions.question import Asked, Question
-from potserver.asking.rays import QUANTILES, Rays
+from potserver.asking.rays import QUANTILES, Rays, RaysPlan
 from potserver.codec.base import FLOATS, decode_array, float32_fields
 from potserver.domain.kernel_map import KernelMap
 from potserver.domain.types import Unknown
 from potserver.limits import Limits
+from potserver.numerics.rays import FirstReturns
 
 
 def decode_rays(query: messages.RaysQuery) -> Rays:
@@ -31,13 +30,16 @@ def decode_rays(query: messages.RaysQuery) -> Rays:
     )
 
 
-def _answer(asked: Asked, query: messages.RaysQuery) -> Iterator[messages.Message]:
-    plan = decode_rays(query).plan(asked.snapshot, asked.limits)
-    yield messages.Rays(**float32_fields(plan.result(asked.parts(plan))))
+def _plan(asked: Asked, query: messages.RaysQuery) -> RaysPlan:
+    return decode_rays(query).plan(asked.snapshot, asked.limits)
+
+
+def _encode(plan: RaysPlan, parts: list[FirstReturns]) -> messages.Rays:
+    return messages.Rays(**float32_fields(plan.result(parts)))
 
 
 def _warm_up(kernels: KernelMap) -> None:
     Rays([[0.0, 0.0, 0.0]], [[1.0, 0.0, 0.0]], max_range_m=1.0).plan(kernels, Limits()).part(0)
 
 
-QUESTION = Question(op="rays", query=messages.RaysQuery, answer=_answer, warm_up=_warm_up)
+QUESTION = Question(op="rays", query=messages.RaysQuery, plan=_plan, whole=_encode, warm_up=_warm_up)

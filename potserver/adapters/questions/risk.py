@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import numpy as np
 
 from potschemas import messages
 from potschemas.messages import DType
 from potserver.adapters.questions.question import Asked, Question
-from potserver.asking.risk import Risk
+from potserver.asking.risk import CellRisk, Risk, RiskPlan
 from potserver.codec.base import FLOATS, decode_array, float32_fields
 from potserver.domain.kernel_map import KernelMap
 from potserver.domain.types import Unknown
@@ -32,13 +30,19 @@ def decode_risk(query: messages.RiskQuery) -> Risk:
     )
 
 
-def _answer(asked: Asked, query: messages.RiskQuery) -> Iterator[messages.Message]:
-    plan = decode_risk(query).plan(asked.snapshot, asked.limits)
-    yield messages.Risk(**float32_fields(plan.result(asked.parts(plan))))
+def _plan(asked: Asked, query: messages.RiskQuery) -> RiskPlan:
+    return decode_risk(query).plan(asked.snapshot, asked.limits)
+
+
+def _encode(plan: RiskPlan, parts: list[CellRisk]) -> messages.Risk:
+    return messages.Risk(**float32_fields(plan.result(parts)))
 
 
 def _warm_up(kernels: KernelMap) -> None:
     Risk(np.eye(4)[None], [[0.0, 0.0, 0.0, 1.0]], resolution_m=1.0).plan(kernels, Limits())
 
 
-QUESTION = Question(op="risk", query=messages.RiskQuery, answer=_answer, warm_up=_warm_up)
+# the plan counts the cells of the whole swept volume: up to a second of work
+QUESTION = Question(
+    op="risk", query=messages.RiskQuery, plan=_plan, whole=_encode, is_quick=False, warm_up=_warm_up
+)

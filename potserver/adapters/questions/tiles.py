@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import numpy as np
 
 from potschemas import messages, wire
@@ -57,11 +55,10 @@ def encode_part(plan: TilesPlan, number: int, run: TileRun) -> messages.TilesPar
     )
 
 
-def _answer(asked: Asked, query: messages.TilesQuery) -> Iterator[messages.Message]:
+def _plan(asked: Asked, query: messages.TilesQuery) -> TilesPlan:
     size_m = asked.served.mapper.settings.tile_size_m
-    plan = decode_tiles(query).plan(asked.state, asked.limits, tile_size_m=size_m)
-    for number, run in enumerate(asked.parts(plan)):
-        yield encode_part(plan, number, run)
+    return decode_tiles(query).plan(asked.state, asked.limits, tile_size_m=size_m)
 
 
-QUESTION = Question(op="tiles", query=messages.TilesQuery, answer=_answer)
+# the plan looks at every tile of the map
+QUESTION = Question(op="tiles", query=messages.TilesQuery, plan=_plan, each=encode_part, is_quick=False)

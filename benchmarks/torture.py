@@ -1,0 +1,104 @@
+"""Tortures a server and its store, and prints what became of it: nothing acknowledged may be lost, and nothing may go unsaid.
+
+    make torture                                                  minutes
+    make torture ARGS='--every 1 --pieces 400 --messages 1000000 --kills 100'   a night
+
+1. Calls: the process of a store is killed before, or in the middle of, every write, fsync, truncate, rename and unlink, or
+   the disk refuses that call, or it and all that follow. A C compiler is needed: the calls are caught by a preloaded library.
+2. Files: in every piece of every file of a store a bit flips, a sector is cleared, or the file ends. And a running store is
+   copied, file by file.
+3. Messages: hostile ones, over Zenoh.
+4. Kills: SIGKILL of a server under load (`kill.py`).
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import logging
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from pathlib import Path
+
+from benchmarks import kill
+from benchmarks.torture_messages import torture_messages
+from benchmarks.torture_store import Outcomes, build_shim, torture_copies, torture_files
+
+
+def run_calls(every: int) -> list[Outcomes]:
+    """Part 1, in a process with the library that catches calls."""
+    with tempfile.TemporaryDirectory() as folder:
+        environ = os.environ | {
+            "LD_PRELOAD": str(build_shim(Path(folder))),
+            "OMP_NUM_THREADS": "1",  # children are forked
+            "OPENBLAS_NUM_THREADS": "1",
+        }
+        command = [sys.executable, "-m", "benchmarks.torture_store", str(every)]
+        told = subprocess.run(
+            command, env=environ, cwd=Path(__file__).parents[1], stdout=subprocess.PIPE, text=True, check=True
+        )
+    found = json.loads(told.stdout.splitlines()[-1])
+    return [Outcomes(o["name"], Counter(o["counts"]), o["wrong"]) for o in found]
+
+
+def run_kills(kills: int, seed: int) -> Outcomes:
+    """Part 4."""
+    with tempfile.TemporaryDirectory() as folder:
+        report = kill.run(Path(folder), kills, seed=seed, longest_s=1.0, snapshot_scans=2)
+    wrong = [f"lost: {scan}" for scan in report.lost]
+    if report.tiles_different:
+        wrong.append(f"{report.tiles_different} of {report.tiles_compared} tiles differ")
+    return Outcomes(
+        f"kill -9 of a server, {kills} times",
+        Counter({"acknowledged scans, all in the map": report.acknowledged}),
+        wrong,
+    )
+
+
+def told(title: str, outcomes: list[Outcomes], begun_s: float) -> int:
+    """Print a table; returns how many went wrong."""
+    print(f"\n{title} ({time.monotonic() - begun_s:.0f} s)")
+    for outcome in outcomes:
+        words = ", ".join(f"{word} {n:,}" for word, n in outcome.counts.most_common())
+        print(f"  {outcome.name}: {outcome.n:,}, wrong {len(outcome.wrong)} ({words})")
+        for line in outcome.wrong[:10]:
+            print(f"    {line}")
+    return sum(len(outcome.wrong) for outcome in outcomes)
+
+
+def main() -> int:
+    """The command; exit code 1 if anything went wrong."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--every", type=int, default=2, metavar="N", help="part 1: every Nth call [2]")
+    parser.add_argument("--pieces", type=int, default=40, help="part 2: of each file [40]")
+    parser.add_argument("--messages", type=int, default=20_000, help="part 3 [20000]")
+    parser.add_argument("--kills", type=int, default=5, help="part 4 [5]")
+    parser.add_argument("--seed", type=int, default=0, help="of parts 2 to 4 [0]")
+    options = parser.parse_args()
+    logging.disable(logging.CRITICAL)  # refusals are what is wanted here
+
+    def show(line: str) -> None:
+        print(f"\r{line:<100}", end="", file=sys.stderr, flush=True)
+
+    wrong, begun_s = 0, time.monotonic()
+    wrong += told("faults of calls", run_calls(options.every), begun_s)
+    begun_s = time.monotonic()
+    wrong += told(
+        "damage of files", [*torture_files(options.pieces, options.seed, show), torture_copies(show)], begun_s
+    )
+    begun_s = time.monotonic()
+    wrong += told("messages", torture_messages(options.messages, options.seed, show), begun_s)
+    begun_s = time.monotonic()
+    wrong += told("kills", [run_kills(options.kills, options.seed)], begun_s)
+    print(f"\n{wrong} wrong")
+    return 1 if wrong else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

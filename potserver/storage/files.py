@@ -1,0 +1,121 @@
+"""The files of a store as the disk has them: made for their owner alone, never reached through a link, and still there."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import stat
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+from potserver.errors import MapFileError, StorageError
+
+_FOLDER_MODE, _FILE_MODE = 0o700, 0o600
+_REASONS = {
+    errno.EROFS: "read_only",
+    errno.EACCES: "permission",
+    errno.EPERM: "permission",
+    errno.ENOSPC: "full",
+    errno.EDQUOT: "full",
+}
+
+
+def disk_fault(doing: str, path: Path, detail: object, reason: str) -> StorageError:
+    """What the disk refuses is not the map's fault, and the error says so.
+
+    Args:
+        doing: What was tried, e.g. `write`.
+        path: Where.
+        detail: What the system said.
+        reason: `read_only`, `permission`, `full` or `io`.
+    """
+    return StorageError(
+        f"cannot {doing} {path}: {detail}. That is the disk's doing, nothing is wrong with the map: free some space or make it"
+        " writable, name another store (--store), serve what it holds with --read-only, or keep maps in memory (--in-memory)",
+        reason=reason,
+    )
+
+
+@contextlib.contextmanager
+def disk_faults(doing: str, path: Path) -> Iterator[None]:
+    """An OSError inside the block becomes a `disk_fault`."""
+    try:
+        yield
+    except OSError as error:
+        reason = _REASONS.get(error.errno or 0, "io")
+        raise disk_fault(doing, path, error.strerror or error, reason) from error
+
+
+def make_private_folder(folder: Path) -> None:
+    """Make a folder that only its owner may enter; one that is there stays as it is.
+
+    Raises:
+        StorageError: the disk refuses.
+    """
+    with disk_faults("make the folder", folder):
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        with contextlib.suppress(FileExistsError):
+            folder.mkdir(mode=_FOLDER_MODE)
+        if not folder.is_dir():
+            raise NotADirectoryError(errno.ENOTDIR, os.strerror(errno.ENOTDIR))
+
+
+def claim_file(path: Path) -> None:
+    """Make a file that only its owner may read, or see that the one that is there is a file and no link to one.
+
+    Raises:
+        MapFileError: it is a link, a folder or a device. StorageError: the disk refuses.
+    """
+    with disk_faults("open", path):
+        try:
+            mode = os.lstat(path).st_mode
+        except FileNotFoundError:
+            os.close(os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY, _FILE_MODE))
+            return
+        if not os.access(path, os.W_OK):  # SQLite would call it an I/O error
+            is_read_only = bool(os.statvfs(path).f_flag & os.ST_RDONLY)
+            number = errno.EROFS if is_read_only else errno.EACCES
+            raise OSError(number, os.strerror(number))
+    if not stat.S_ISREG(mode):
+        what = "a symbolic link" if stat.S_ISLNK(mode) else "no regular file"
+        raise MapFileError(
+            f"{path} is {what}: a store is written to its own files only. Put the file itself there, or link the whole store",
+            reason="not_a_map",
+        )
+
+
+class NamedFiles:
+    """What the names of open files meant when they were opened: who removes or replaces a file leaves its writer a ghost."""
+
+    def __init__(self, paths: Iterable[Path]) -> None:
+        """Note the files.
+
+        Raises:
+            StorageError: one is not there.
+        """
+        self._known = {path: _identity(path) for path in paths}
+        self.check()
+
+    def check(self) -> None:
+        """See that every name still means the file that was opened.
+
+        Raises:
+            StorageError: one does not; `reason` is `gone`.
+        """
+        for path, known in self._known.items():
+            if known is None or _identity(path) != known:
+                raise StorageError(
+                    f"{path} was removed, moved or replaced while the server writes it: what is written now would be lost. Put"
+                    " the store back as it was, or start the server anew",
+                    reason="gone",
+                )
+
+
+def _identity(path: Path) -> tuple[int, int] | None:
+    with disk_faults("look at", path):
+        try:
+            found = os.lstat(path)
+        except (FileNotFoundError, NotADirectoryError):
+            return None
+    return found.st_dev, found.st_ino
