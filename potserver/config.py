@@ -53,7 +53,6 @@ class QuerySettings:
 
     threads: Annotated[int, "questions in work at once"] = 2
     max_queued: Annotated[int, "questions that may wait, all maps; one more is refused at once"] = 64
-    deadline_s: Annotated[float, "for questions that name no deadline: nobody is taken to wait longer"] = 10.0
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)

@@ -130,7 +130,7 @@ class MapNode:
             limits=limits,
             durable=durable,
         )
-        answers = Answers(served, shared.pool, deadline_s=settings.queries.deadline_s)
+        answers = Answers(served, shared.pool)
         return [
             PoseSubscriber(session, map_keys, poses=poses, health=health, allowed_robots=allowed),
             CloudSubscriber(session, map_keys, door),

@@ -70,7 +70,7 @@ def _greeted(
     return Cause(
         True,
         f"somebody listens at {endpoint} and does not let this client in: it wants a user and a password (-c FILE),"
-        " has as many sessions as it may, or is no Zenoh node",
+        " has as many sessions as it may, is too busy to answer, or is no Zenoh node",
     )
 
 

@@ -17,6 +17,7 @@ from potserver.log import get_logger
 
 log = get_logger("potserver.queries")
 
+DEADLINE_S = 10.0  # that an asker waits who does not say: Zenoh's own time-out of a query
 SHORT_BYTES = 65_536  # of a question that may be a short one: 2,700 points
 
 
@@ -26,11 +27,10 @@ class Answers:
     Args:
         served: The map.
         pool: Whose workers answer.
-        deadline_s: How long an asker waits that does not say so.
     """
 
-    def __init__(self, served: Served, pool: QueryPool, *, deadline_s: float) -> None:
-        self._served, self._pool, self._deadline_s = served, pool, deadline_s
+    def __init__(self, served: Served, pool: QueryPool) -> None:
+        self._served, self._pool = served, pool
 
     def submit(self, query: zenoh.Query, question: Question[Any], key: str, name: str) -> None:
         """Queue a query for a worker.
@@ -98,7 +98,7 @@ class Answers:
         deadline_ms: float | None = getattr(message, "deadline_ms", None)
 
         def check_may_go_on() -> None:
-            check_deadline(arrived_s, self._deadline_s * 1e3 if deadline_ms is None else deadline_ms)
+            check_deadline(arrived_s, DEADLINE_S * 1e3 if deadline_ms is None else deadline_ms)
             if self._pool.is_closing:
                 raise ShuttingDownError("the server is closing")
 

@@ -248,8 +248,11 @@ def _answer_of(rig: Any) -> Any:
     return FakeSnapshot(FakeMapper(), KernelSet.empty(), 0).occupancy(np.zeros((1, 3)))
 
 
-def test_a_question_without_a_deadline_has_the_default_one(make_rig: MakeRig) -> None:
-    rig = make_rig(queries__deadline_s=1e-9)
+def test_a_question_without_a_deadline_has_the_default_one(
+    make_rig: MakeRig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("potserver.adapters.answers.DEADLINE_S", 1e-9)
+    rig = make_rig()
     client = rig.client()
     error = client.error("points", HERE)
     assert (error.code, error.retryable) == (ErrorCode.DEADLINE, True)
