@@ -331,7 +331,7 @@ def _atom_store(mappers: list[MappingService], settings: Settings) -> AtomStore:
     return AtomStore(
         mappers[0].dictionary,
         use,
-        writable=settings.atoms.writable,
+        writable=settings.atoms.writable and not settings.store.read_only,
         file=Path(str(settings.dictionary)) if is_saved else None,
         threads=settings.threads or default_threads(),
     )

@@ -88,6 +88,6 @@ class AtomStore:
     def _check_writable(self) -> None:
         if not self._writable:
             raise ReadOnlyError(
-                "this server takes no changes of its dictionary (atoms.writable is false); its operator may start it"
-                " with --set atoms.writable=true"
+                "this server takes no changes of its dictionary (atoms.writable is false, or store.read_only true); its"
+                " operator may start it with --set atoms.writable=true"
             )

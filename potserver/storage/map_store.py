@@ -282,6 +282,7 @@ class MapStore:
             raise TooLargeError(
                 f"{len(others)} maps are saved already, the limit is {self._max_saved}: move some out of {self._saved}"
             )
+        make_private_folder(self._saved.parent)
         n_bytes = write_map(path, state, Origin(self._map_id, self._keeps_evidence, heard))
         self._health.count("store.saved")
         return f"{state.n_scans} scans saved as {path}, {n_bytes} bytes"

@@ -8,8 +8,6 @@ from pathlib import Path
 
 import pytest
 
-from potclient.errors import UsageError
-from potclient.session import parse_overrides
 from potserver.cli import main
 
 WHO = ("--robots", "r1,r2", "--planners", "p1", "--operators", "ops")
@@ -85,11 +83,3 @@ def test_a_check_needs_what_it_checks(tmp_path: Path, capsys: pytest.CaptureFixt
     (tmp_path / "roles.json").write_text("{}")
     assert main(["acl", "--check", "-o", str(tmp_path)]) == 2
     assert "not the roles" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(
-    "pair", ["transport/auth/usrpwd/password:x", 'transport/auth/usrpwd:{user:"u",password:"x"}']
-)
-def test_a_client_takes_no_secret_from_its_command_line(pair: str) -> None:
-    with pytest.raises(UsageError, match="put secrets in a file"):
-        parse_overrides([pair])

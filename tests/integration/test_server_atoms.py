@@ -142,6 +142,21 @@ def test_a_refused_atom_changes_nothing_and_says_why(serve: Serve, site: Path) -
     assert client.add_atom(mirrored(atom, "mirrored")).n_atoms == len(before) + 1
 
 
+def test_changes_of_the_dictionary_are_audit_lines(
+    serve: Serve, site: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    client = serve(dictionary=str(site))
+    name = names(client)[0]
+    with caplog.at_level("INFO", logger="potserver.audit"):
+        client.remove_atom(name)
+        with pytest.raises(UnknownAtomError):
+            client.remove_atom(name)
+    done, refused = (record.msg for record in caplog.records if record.name == "potserver.audit")
+    assert (done["what"], done["result"], done["atom_id"]) == ("control.atoms", "removed", name)
+    assert (refused["what"], refused["reason"]) == ("control.atoms", "unknown_atom")
+    assert done["who"] == refused["who"] != "unnamed"
+
+
 def test_a_server_is_read_only_unless_it_is_told_otherwise(
     serve: Serve, site: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

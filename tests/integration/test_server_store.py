@@ -261,7 +261,7 @@ def test_a_read_only_server_answers_and_takes_nothing_in(serve: Serve) -> None:
     before = client.one("points", HERE)
     client.close()
     assert server.stop()
-    server, client = serve(store__read_only=True)
+    server, client = serve(store__read_only=True, atoms__writable=True)
     receipts = client.receipts("r1")
     assert client.one("points", HERE).mean.data == before.mean.data
     assert client.one("info").durable is False
@@ -273,6 +273,7 @@ def test_a_read_only_server_answers_and_takes_nothing_in(serve: Serve) -> None:
         ("clear", messages.ControlRequest()),
         ("save", messages.ControlRequest()),
         ("load", named("one")),
+        ("atoms", messages.AtomsQuery(action=messages.AtomsAction.REMOVE, atom_id="any")),
     ):
         assert client.control(verb, request).code is ErrorCode.READ_ONLY
     assert client.one("points", HERE).mean.data == before.mean.data

@@ -216,7 +216,8 @@ def test_a_store_is_for_its_owner_alone(tmp_path: Path, open_map: OpenMap) -> No
         path.relative_to(tmp_path).as_posix(): stat.S_IMODE(path.stat().st_mode)
         for path in tmp_path.rglob("*")
     }
-    assert {modes.pop(name) for name in ("store", "store/default", "store/saved")} == {0o700}
+    folders = ("store", "store/default", "store/saved", "store/saved/default")
+    assert {modes.pop(name) for name in folders} == {0o700}
     assert len(modes) > 5
     assert set(modes.values()) == {0o600}, modes
 
