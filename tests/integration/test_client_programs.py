@@ -127,7 +127,7 @@ def test_a_load_test_accounts_for_every_cloud(make_rig: Any, monkeypatch: pytest
 
 def test_a_load_test_that_loses_receipts_says_so() -> None:
     settings = LoadSettings(
-        robots=1, rate_hz=20, planners=1, duration_s=0.2, n_points=50, query_points=20, receipt_timeout_s=0.1
+        robots=1, rate_hz=20, planners=1, duration_s=1.0, n_points=50, query_points=20, receipt_timeout_s=0.1
     )
     with ScriptedServer() as server:
         server.on_clouds(lambda robot, cloud: None)
