@@ -9,7 +9,8 @@ beams in a row miss what is still there with a probability of
 
 When that falls below one in `odds`, what stood there has left. Nothing in this depends on the range, the sensor or the
 background: a far box of few echoes takes more scans than a near one of many, and a fence that lets nine of ten beams through
-stays. Voxels of missed hits that touch each other count together: they are one thing.
+stays. Voxels of missed hits that touch each other count together: they are one thing. They are not independent, and neither
+are the beams of one scan, so `odds` must be far higher than what one would bet.
 """
 
 from __future__ import annotations
@@ -28,9 +29,7 @@ from potserver.numerics.threads import parallel_map, spans
 from potserver.numerics.voxel_hash import any_around, empty_table, find, pack
 
 _BEHIND = 0.75  # resolutions that a beam must go on behind a hit to have passed through it; less is a graze, or noise
-_ALONG = (
-    2  # voxels: hits that a beam passes so near to each other share its one pass, for it may graze a surface
-)
+_ALONG = 2  # voxels: hits that a beam passes so near to each other share its one pass, for it may graze
 _PRIOR = 0.5  # of an echo, and of none: beams that each voxel has had before any were counted
 _ONE_SCAN = 3.0  # misses, at most: beams of one scan lie in the same ring, and miss a wire together
 _WALK = 0.75  # step of a walk along a beam, in voxels of hits
