@@ -403,15 +403,13 @@ def _fit(region: Region, lower: Float64, upper: Float64, options: FusionOptions,
     grid, kernels = region.grid, region.kernels.kernels
     pad = grid.coarse_m
     where = evidence.positions(region.rows, grid.fine_m)
-    rows = np.flatnonzero(
-        inside_box(where, lower - 2 * pad, upper + 2 * pad)
-        & evidence.is_alive(region.rows)
-        & evidence.is_label(region.rows)
-    )
+    counts = evidence.counts(region.rows, evidence.cells(region.rows), _SATURATION)
+    counts[~evidence.is_alive(region.rows)] = 0.0
+    rows = np.flatnonzero(inside_box(where, lower - 2 * pad, upper + 2 * pad) & (counts > 0.0))
+    counts = counts[rows]
     local = np.flatnonzero(inside_box(kernels.hinge_mean, lower - 4 * pad, upper + 4 * pad))
     hinge = kernels.hinge_mean[local]
     free = inside_box(hinge, lower, upper)
-    counts = evidence.counts(region.rows, evidence.cells(region.rows), _SATURATION)[rows]
     blocks = feature_blocks(
         where[rows],
         hinge,
