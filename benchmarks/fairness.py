@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.server_process import ServerProcess
+from benchmarks.server_process import serving
 from benchmarks.shared import keep, parser_of
 from potclient import MapClient, PotclientError
 from potclient.datasets import open_dataset
@@ -39,16 +39,8 @@ def main() -> int:
     if options.asker:
         _ask(options)
         return 0
-    with tempfile.TemporaryDirectory() as folder:
-        server = ServerProcess(
-            "serve", "--listen", "tcp/127.0.0.1:0", "--store", folder, "--log-format", "json"
-        )
-        try:
-            endpoint = str(server.event("server_started")["endpoints"][0])
-            found = _measure(endpoint, options)
-        finally:
-            server.popen.terminate()
-            server.popen.wait()
+    with tempfile.TemporaryDirectory() as folder, serving("--store", folder) as endpoint:
+        found = _measure(endpoint, options)
     for name, value in found.items():
         print(f"{name}: {value}")
     keep(options, found)

@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 import threading
+from collections.abc import Iterator
 from typing import Any
 
 START_S = 240.0  # the first start on a machine compiles
@@ -82,3 +83,14 @@ class ServerProcess:
         self.wait()
         assert self.popen.stderr is not None
         self.popen.stderr.close()
+
+
+@contextlib.contextmanager
+def serving(*flags: str) -> Iterator[str]:
+    """The endpoint of a server with these flags, which ends with the block."""
+    server = ServerProcess("serve", "--listen", "tcp/127.0.0.1:0", "--log-format", "json", *flags)
+    try:
+        yield str(server.event("server_started")["endpoints"][0])
+    finally:
+        server.popen.terminate()
+        server.popen.wait()

@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.server_process import ServerProcess
+from benchmarks.server_process import serving
 from benchmarks.shared import keep, parser_of
 from potclient import MapClient, PotclientError
 
@@ -40,15 +40,8 @@ def main() -> int:
         _live(options)
         return 0
     shm = ("--shm",) if options.shm else ()
-    server = ServerProcess(
-        "serve", "--listen", "tcp/127.0.0.1:0", "--in-memory", "--log-format", "json", *shm
-    )
-    try:
-        endpoint = str(server.event("server_started")["endpoints"][0])
+    with serving("--in-memory", *shm) as endpoint:
         found = _measure(endpoint, options)
-    finally:
-        server.popen.terminate()
-        server.popen.wait()
     for name, value in found.items():
         print(f"{name}: {value}")
     keep(options, found)

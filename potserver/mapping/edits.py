@@ -127,7 +127,7 @@ def remove_robot(
 ) -> tuple[TiledMap, set[TileIndex]]:
     """The map without what one robot has seen, and the tiles that changed; places that nobody else saw are unknown again.
 
-    What the robot's scans made fade of others' hits does not come back. The robot's number is free for another.
+    What the robot's scans took out of others' hits does not come back. The robot's number is free for another.
 
     Raises:
         UnknownRobotError: the map has nothing from this robot.

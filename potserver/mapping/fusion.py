@@ -182,7 +182,7 @@ def fuse(
 
 
 def _samples_of(look: Look, region: Region, options: FusionOptions, threads: int) -> Samples:
-    """All that a scan says, and free samples where its beams see through what stood; the rows of that are weakened in place."""
+    """All that a scan says; rows of hits that have left, as its beams see through their place, are emptied in place."""
     grid, start = region.grid, look.origin - region.origin_m
     labelled = look.labelled
     parts = [

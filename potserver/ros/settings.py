@@ -9,7 +9,7 @@ from typing import Annotated
 import numpy as np
 
 from potclient.arrays import Float64
-from potclient.poses import quaternion_rotation
+from potclient.poses import quaternion_pose
 from potserver.errors import SettingsError
 
 TF = "/tf"  # as the source of poses
@@ -88,11 +88,7 @@ class RosSettings:
         if not self.extrinsic:
             return None
         x, y, z, qx, qy, qz, qw = self.extrinsic
-        pose: Float64 = np.eye(4)
-        quaternion = np.array([qw, qx, qy, qz])
-        pose[:3, :3] = quaternion_rotation(*(quaternion / np.linalg.norm(quaternion)))
-        pose[:3, 3] = x, y, z
-        return pose
+        return quaternion_pose(np.array([x, y, z]), np.array([qw, qx, qy, qz]))
 
 
 def _need(name: str, value: object, ok: bool, what: str) -> None:

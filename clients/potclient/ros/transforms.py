@@ -13,7 +13,7 @@ import numpy as np
 
 from potclient.arrays import Float64
 from potclient.errors import NoTransformError, RosMessageError
-from potclient.poses import interpolate, quaternion_rotation
+from potclient.poses import interpolate, quaternion_pose
 from potclient.ros.types import ODOMETRY, POSE_WITH_COVARIANCE, frame_of, stamp_of
 
 MAX_FRAMES = 10_000  # of a tree
@@ -242,10 +242,7 @@ def _pose(position: tuple[float, float, float], q: Any, what: str) -> Float64:
         raise RosMessageError(
             f"{what}: position {position}, quaternion of length {length:g}", reason="bad_transform"
         )
-    pose: Float64 = np.eye(4)
-    pose[:3, :3] = quaternion_rotation(*(quaternion / length))
-    pose[:3, 3] = position
-    return pose
+    return quaternion_pose(np.array(position, np.float64), quaternion)
 
 
 def _names(frames: list[str]) -> str:

@@ -24,7 +24,6 @@ from potserver.numerics.evidence.rows import (
     decay,
     forget,
     is_alive,
-    is_label,
     positions,
     tile_of,
 )
@@ -52,7 +51,6 @@ __all__ = [
     "decay",
     "forget",
     "is_alive",
-    "is_label",
     "positions",
     "see_through",
     "tile_of",

@@ -9,7 +9,7 @@ import numpy as np
 from potclient.arrays import Float64
 from potclient.datasets.files.beams import Beams, beams_of_columns, short
 from potclient.errors import DatasetError
-from potclient.poses import quaternion_rotation
+from potclient.poses import quaternion_pose
 
 
 def read_pcd(path: Path) -> Beams:
@@ -38,7 +38,7 @@ def read_viewpoint(path: Path) -> Float64:
     """(4, 4): the VIEWPOINT of a PCD header (tx ty tz qw qx qy qz); identity if there is none.
 
     Raises:
-        DatasetError: it is not seven numbers, or the quaternion is zero.
+        DatasetError: it is not seven numbers, the quaternion is zero, or a number is not finite.
     """
     with path.open("rb") as file:
         head = file.read(4096)
@@ -55,8 +55,8 @@ def read_viewpoint(path: Path) -> Float64:
             norm = float(np.sqrt(w * w + x * x + y * y + z * z))
             if not norm > 0:
                 raise DatasetError(f"{path}: VIEWPOINT has a quaternion of length {norm}")
-            pose = np.eye(4)
-            pose[:3, :3] = quaternion_rotation(w / norm, x / norm, y / norm, z / norm)
-            pose[:3, 3] = tx, ty, tz
-            return pose
+            try:
+                return quaternion_pose(np.array([tx, ty, tz]), np.array([w, x, y, z]))
+            except ValueError as error:
+                raise DatasetError(f"{path}: VIEWPOINT: {error}") from error
     return np.eye(4)
