@@ -81,7 +81,9 @@ class Answers:
                     reply(query, key, wire)
                 if step.rest_is_short is not None:
                     yield step.rest_is_short
-            self._served.health.count(f"{name}.ok")  # before the end, so that who has the answer sees it counted
+            self._served.health.count(
+                f"{name}.ok"
+            )  # before the end, so that who has the answer sees it counted
             self._served.health.observe(question.op, (time.monotonic() - arrived_s) * 1e3)
             query.drop()
         except PotserverError as error:  # expected: the asker gets a typed reply

@@ -19,7 +19,8 @@ from potserver.domain.order import MAX_ROBOTS
 from potserver.domain.types import Bool, Float32, Float64, KernelSet
 from potserver.errors import MapFullError, OutOfRangeError, SettingsError, ShapeError
 from potserver.numerics.bricks import Part
-from potserver.numerics.evidence import Rows, decay, is_alive, tile_of
+from potserver.numerics.evidence import Cells, Rows, cells, decay, is_alive, tile_of
+from potserver.numerics.grouping import by_number
 from potserver.numerics.threads import parallel_map
 from potserver.numerics.voxel_hash import CELL_LIMIT
 
@@ -265,6 +266,7 @@ class Region:
     upper: TileIndex  # inclusive
     rows: Rows
     kernels: MapKernels
+    cells: Cells | None = None  # of the rows, once known
 
     @staticmethod
     def of(
@@ -316,31 +318,40 @@ class Region:
         """
         low, high = self.grid.index_of(lower_m), self.grid.index_of(upper_m)
         size = np.asarray(self.upper, np.int64) - np.asarray(self.lower, np.int64) + 1
-        rows = self.rows.take(is_alive(self.rows))
-        row_tile, voxel = tile_of(rows, self.grid.voxels, size)
-        rows = rows._replace(voxel=voxel)
+        rows, row_cuts = self._rows_by_tile(size)
         hinge = self.kernels.kernels.hinge_mean
         # rounding may put a kernel of the outermost tiles just outside
         kernel_tile = np.clip(np.floor(hinge / self.grid.size_m), 0, size - 1).astype(np.int64)
         kernels = self.kernels.moved(np.asarray(-kernel_tile * self.grid.size_m, np.float64))
-        row_members = _by_number(row_tile, int(size.prod()))
-        kernel_members = _by_number(np.ravel_multi_index(tuple(kernel_tile.T), tuple(size)), int(size.prod()))
+        kernel_of, kernel_cuts = by_number(
+            np.ravel_multi_index(tuple(kernel_tile.T), tuple(size)), int(size.prod())
+        )
         out = {}
         for number, shift in enumerate(itertools.product(*(range(s) for s in size))):
             index = (self.lower[0] + shift[0], self.lower[1] + shift[1], self.lower[2] + shift[2])
             if all(x <= i <= y for x, i, y in zip(low, index, high, strict=True)):
                 out[index] = Tile(
-                    rows.take(row_members[number]), kernels.take(kernel_members[number]), revision, stamp_ns
+                    rows.take(np.arange(*row_cuts[number : number + 2])),
+                    kernels.take(kernel_of[slice(*kernel_cuts[number : number + 2])]),
+                    revision,
+                    stamp_ns,
                 )
         return out
+
+    def _rows_by_tile(self, size: NDArray[np.int64]) -> tuple[Rows, NDArray[np.int64]]:
+        """The rows that still say something, relative to their tiles, and where each tile's start; (3,) tiles along the axes.
+
+        Rows of one cell lie together, so that the next scan has to look for each cell once.
+        """
+        number, n_cells = self.cells or cells(self.rows)
+        alive = np.flatnonzero(is_alive(self.rows))
+        by_cell = alive[by_number(number[alive], n_cells)[0]]
+        rows = self.rows.take(by_cell)
+        tile, voxel = tile_of(rows, self.grid.voxels, size)
+        order, cuts = by_number(tile, int(size.prod()))
+        return rows._replace(voxel=voxel).take(order), cuts
 
 
 def voxels_along(rows: Rows, grid: TileGrid) -> NDArray[np.int64]:
     """(R, 1) voxels along a tile's edge, for each row in the voxels of its kind."""
     return np.where(rows.is_half, 2 * grid.voxels, grid.voxels)[:, None]
-
-
-def _by_number(number: NDArray[np.intp], n: int) -> list[NDArray[np.intp]]:
-    """For each of n numbers, where it stands, ascending."""
-    counts = np.bincount(number, minlength=n)
-    return np.split(np.argsort(number, kind="stable"), np.cumsum(counts)[:-1])

@@ -34,7 +34,7 @@ from potserver.mapping.surfaces import FACE_SAMPLES, FaceSamples, Samples, surfa
 from potserver.numerics import evidence
 from potserver.numerics.arrays import UInt8
 from potserver.numerics.beams import Beams, LabelledPoints, beam_weights
-from potserver.numerics.feature_blocks import Blocks, feature_blocks, gradient_and_diagonal
+from potserver.numerics.feature_blocks import Blocks, feature_blocks, gradient_and_diagonal, two_diagonals
 from potserver.numerics.geometry import bounds, inside_box
 from potserver.numerics.lattice_nodes import new_nodes
 from potserver.numerics.warm_fit import Prior, Solver, warm_fit
@@ -270,16 +270,14 @@ def add_evidence(
     Within a box, old rows that say little join others: see `evidence.add_sparing`.
     """
     fine_m = region.grid.fine_m
-    beside = samples.kind > evidence.HIT
-    along = samples.take(~beside)
-    rows, gained, n_old = evidence.add_sparing(region.rows, *along, fine_m, source, within=within, turn=turn)
-    new = slice(n_old, len(rows.kind))
-    rows, more = evidence.add(rows, *samples.take(beside), fine_m, source)
-    more[: len(gained)] += gained
+    rows, gained, n_old, cells = evidence.add_sparing(
+        region.rows, *samples, fine_m, source, within=within, turn=turn
+    )
     evidence.clip(rows, _MEMORY)
-    evidence.forget(rows, more, evidence.cells(rows), _MEMORY)
-    region.rows = rows
-    return rows.take(new)
+    evidence.forget(rows, gained, cells, _MEMORY)
+    region.rows, region.cells = rows, cells
+    new = rows.take(slice(n_old, None))
+    return new.take(new.kind <= evidence.HIT)
 
 
 def add_kernels(
@@ -387,12 +385,11 @@ def _support_of(blocks: Blocks, kind: UInt8, counts: Float32, threads: int) -> _
     worth = np.minimum(counts, np.float32(1.0)) * np.where(
         kind & 1, np.float32(_WORTH_OF_HALF), np.float32(1.0)
     )
-    zero = np.zeros(len(kind), np.float32)
     seen, unseen = (
-        gradient_and_diagonal(blocks, zero, weight[blocks.order].astype(np.float32), threads=threads)[1]
-        for weight in (np.where(is_shadow, 0.0, worth), is_shadow & (counts > 0))
+        weight[blocks.order].astype(np.float32)
+        for weight in (np.where(is_shadow, np.float32(0), worth), is_shadow & (counts > 0))
     )
-    return _Support(seen, unseen)
+    return _Support(*two_diagonals(blocks, seen, unseen, threads=threads))
 
 
 def _fit(region: Region, lower: Float64, upper: Float64, options: FusionOptions, threads: int) -> bool:
@@ -403,7 +400,7 @@ def _fit(region: Region, lower: Float64, upper: Float64, options: FusionOptions,
     grid, kernels = region.grid, region.kernels.kernels
     pad = grid.coarse_m
     where = evidence.positions(region.rows, grid.fine_m)
-    counts = evidence.counts(region.rows, evidence.cells(region.rows), _SATURATION)
+    counts = evidence.counts(region.rows, region.cells or evidence.cells(region.rows), _SATURATION)
     counts[~evidence.is_alive(region.rows)] = 0.0
     rows = np.flatnonzero(inside_box(where, lower - 2 * pad, upper + 2 * pad) & (counts > 0.0))
     counts = counts[rows]

@@ -21,6 +21,9 @@ from potserver.numerics.geometry import bounds
 from potserver.numerics.kernel_index import build_index
 from potserver.numerics.threads import parallel_map, spans
 
+# Kernels of a cube of rounded values are filled up to a multiple of this: whole vectors are faster than what is left over.
+_LANES = 8
+_FAR = np.array([1e4, 1e4, 1e4, -1.0], np.float32)  # relative hinge, m, and -gamma of what fills up
 _SPANS = 8  # of cubes; fixed, so that sums over spans do not depend on the number of threads
 
 
@@ -30,7 +33,7 @@ class Block(NamedTuple):
     cuts: Int64  # (C + 1,) first row of each cube, in the sorted order
     kernels: Int64  # (C + 1,) where each cube's kernels start in `numbers`
     starts: Int64  # (C + 1,) where each cube's phi starts in `phi`
-    numbers: Int32
+    numbers: Int32  # of kernels; what fills up a cube of rounded values is 0, with a phi of 0
     phi: Float32 | UInt8  # in units of `Blocks.unit`
 
 
@@ -88,7 +91,7 @@ def feature_blocks(
             inside,
             *_build(
                 grouped, inside, groups[span[0] : span[1] + 1] - groups[span[0]], index, kind, np.float32(1.0) / unit,
-                np.float32(0.0 if exact else 0.5),
+                np.float32(0.0 if exact else 0.5), 1 if exact else _LANES,
             ),
         )  # fmt: skip
 
@@ -114,6 +117,19 @@ def gradient_and_diagonal(
         lambda b: _gradient(b, blocks.unit, residual, curvature, blocks.n_kernels),
         blocks.parts,
         threads,
+    )
+    total = np.zeros((2, blocks.n_kernels), np.float32)
+    for part in parts:
+        total += part
+    return total[0], total[1]
+
+
+def two_diagonals(
+    blocks: Blocks, one: Float32, other: Float32, *, threads: int = 1
+) -> tuple[Float32, Float32]:
+    """(K,) diagonals of Phi^T diag(one) Phi and of Phi^T diag(other) Phi, in one pass."""
+    parts = parallel_map(
+        lambda b: _two_diagonals(b, blocks.unit, one, other, blocks.n_kernels), blocks.parts, threads
     )
     total = np.zeros((2, blocks.n_kernels), np.float32)
     for part in parts:
@@ -149,7 +165,7 @@ def _store(row, scale, offset, out):
 
 
 @nb.njit(nogil=True, error_model="numpy", cache=True)
-def _build(points, cuts, groups, index, kind, scale, offset):
+def _build(points, cuts, groups, index, kind, scale, offset, lanes):
     hinge, columns = index.hinge, index.columns
     n_cubes = len(cuts) - 1
     kernels = np.zeros(n_cubes + 1, np.int64)
@@ -175,8 +191,8 @@ def _build(points, cuts, groups, index, kind, scale, offset):
             a, b = cuts[cube], cuts[cube + 1]
             lower, upper = bounds(points[a:b])
             first = kernels[cube]
-            if first + n_near > len(reached):
-                more = np.empty(2 * (first + n_near), np.int64)
+            if first + n_near + lanes > len(reached):
+                more = np.empty(2 * (first + n_near + lanes), np.int64)
                 more[:first] = reached[:first]
                 reached = more
             x0, y0, z0 = np.float32(lower[0] - gx), np.float32(lower[1] - gy), np.float32(lower[2] - gz)
@@ -191,6 +207,9 @@ def _build(points, cuts, groups, index, kind, scale, offset):
                     n += 1
             for c in range(3):
                 centre[cube, c] = 0.5 * (lower[c] + upper[c])
+            while n % lanes:  # a kernel far away: it has phi 0, and adds nothing
+                reached[first + n] = -1
+                n += 1
             most = max(most, n)
             kernels[cube + 1] = first + n
             starts[cube + 1] = starts[cube] + (b - a) * n
@@ -203,6 +222,10 @@ def _build(points, cuts, groups, index, kind, scale, offset):
         cx, cy, cz = centre[cube]
         for i in range(n):
             m = reached[first + i]
+            if m < 0:
+                local[:4, i] = _FAR
+                numbers[first + i] = 0
+                continue
             local[0, i] = hinge[m, 0] - cx
             local[1, i] = hinge[m, 1] - cy
             local[2, i] = hinge[m, 2] - cz
@@ -238,6 +261,15 @@ def _axpy_both(row, a, b, out, squares):
         phi = np.float32(row[i])
         out[i] += a * phi
         squares[i] += b * phi * phi
+
+
+@inner_loop
+def _add_squares(row, a, b, one, other):
+    for i in range(len(row)):
+        phi = np.float32(row[i])
+        square = phi * phi
+        one[i] += a * square
+        other[i] += b * square
 
 
 @nb.njit(nogil=True, error_model="numpy", cache=True)
@@ -280,6 +312,26 @@ def _gradient(block, unit, residual, curvature, n_kernels):
             m = numbers[first + i]
             out[0, m] += unit * sums[i]
             out[1, m] += unit * unit * squares[i]
+    return out
+
+
+@nb.njit(nogil=True, error_model="numpy", cache=True)
+def _two_diagonals(block, unit, one, other, n_kernels):
+    cuts, kernels, starts, numbers, phi = block
+    out = np.zeros((2, n_kernels), np.float32)
+    first_sums, second_sums = np.empty(widest(kernels), np.float32), np.empty(widest(kernels), np.float32)
+    for c in range(len(cuts) - 1):
+        first, at = kernels[c], starts[c]
+        n = kernels[c + 1] - first
+        first_sums[:n] = 0
+        second_sums[:n] = 0
+        for q in range(cuts[c], cuts[c + 1]):
+            _add_squares(phi[at : at + n], one[q], other[q], first_sums, second_sums)
+            at += n
+        for i in range(n):
+            m = numbers[first + i]
+            out[0, m] += unit * unit * first_sums[i]
+            out[1, m] += unit * unit * second_sums[i]
     return out
 
 

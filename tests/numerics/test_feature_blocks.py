@@ -25,7 +25,7 @@ def _dense(blocks: fb.Blocks) -> np.ndarray:
             numbers = part.numbers[part.kernels[c] : part.kernels[c + 1]]
             phi = part.phi[part.starts[c] : part.starts[c + 1]].reshape(-1, len(numbers))
             for r, row in zip(range(part.cuts[c], part.cuts[c + 1]), phi, strict=True):
-                out[blocks.order[r], numbers] = row
+                np.add.at(out[blocks.order[r]], numbers, row)
     return out
 
 
@@ -41,17 +41,23 @@ def test_every_feature_above_the_cut_is_there(case, edge_m: float, threads: int)
     assert blocks.n_values == sum(len(p.phi) for p in blocks.parts) >= stored.sum()
 
 
-def test_products(case) -> None:
+@pytest.mark.parametrize("bytes_a_value", [1, 4])
+def test_products(case, bytes_a_value: int) -> None:
     points, hinge, gamma, _ = case
     rng = np.random.default_rng(1)
-    blocks = feature_blocks(points, hinge, gamma, edge_m=1.0, cut=0.02, threads=2)
-    phi = _dense(blocks)[blocks.order]
+    blocks = feature_blocks(
+        points, hinge, gamma, edge_m=1.0, cut=0.02, bytes_a_value=bytes_a_value, threads=2
+    )
+    phi = _dense(blocks)[blocks.order] * blocks.unit
     w, r, c = (rng.normal(size=n).astype(np.float32) for n in (400, 900, 900))
     c = np.abs(c)
     np.testing.assert_allclose(fb.product(blocks, w), phi @ w, atol=1e-4)
     gradient, diagonal = fb.gradient_and_diagonal(blocks, r, c)
     np.testing.assert_allclose(gradient, phi.T @ r, atol=1e-4)
     np.testing.assert_allclose(diagonal, np.square(phi).T @ c, atol=1e-4)
+    one, other = fb.two_diagonals(blocks, c, r)
+    np.testing.assert_allclose(one, np.square(phi).T @ c, atol=1e-4)
+    np.testing.assert_allclose(other, np.square(phi).T @ r, atol=1e-4)
     np.testing.assert_allclose(fb.normal_product(blocks, c, w), phi.T @ (c * (phi @ w)), atol=1e-3)
 
 

@@ -8,8 +8,9 @@ import numba as nb
 import numpy as np
 
 from potserver.numerics.arrays import Bool, Float32, Float64, UInt8
-from potserver.numerics.evidence.rows import FREE, HIT, Rows, fill
-from potserver.numerics.voxel_hash import any_around, empty_table, enter, find, pack
+from potserver.numerics.evidence.rows import FREE, HIT, Cells, Rows, fill
+from potserver.numerics.flag_grid import FlagGrid, may_be_around
+from potserver.numerics.voxel_hash import find, pack
 
 TURNS = 3  # scans in which each old row is looked at once: a third of the old rows a scan keeps the cost low
 _LIGHT = 1.01  # looks: the most weight of a new row that may join another; its parts add up with rounding
@@ -29,6 +30,7 @@ class Joined(NamedTuple):
     rows: Rows  # those that are left of the old ones first, in their order
     weight: Float32  # (R,) what each row gained by the samples, with what joined it
     n_old: int
+    cells: Cells  # of the rows
 
 
 def add_sparing(
@@ -72,23 +74,28 @@ def add_sparing(
     first, last = np.floor(lower / fine_m).astype(np.int64) + 1, np.floor(upper / fine_m).astype(np.int64) - 1
     # the part shifts with every round, so that a source that has every third turn gets to all parts too
     part = (turn + turn // TURNS) % TURNS
+    hits = FlagGrid.of(added.rows.voxel[added.rows.occupied] >> 1)
     _join_light(
-        added.rows, added.weight, left, n_before, source, fine_m, first, last, part, added.table, added.keys,
-        empty_table(len(added.keys)),
+        added.rows, added.weight, left, n_before, source, fine_m, first, last, part, added.places, added.n_cells, hits
     )  # fmt: skip
-    return Joined(added.rows.take(left), added.weight[left], int(left[:n_before].sum()))
+    cells = Cells(added.places.number[left], added.n_cells)
+    return Joined(added.rows.take(left), added.weight[left], int(left[:n_before].sum()), cells)
 
 
 @nb.njit(nogil=True, error_model="numpy", cache=True)
-def _join_light(rows, gained, left, n_old, source, fine_m, first, last, part, table, keys, hit_table):
-    """Join rows, in place; `left` says afterwards which are left. Old ones join only in voxels from `first` to `last`."""
+def _join_light(rows, gained, left, n_old, source, fine_m, first, last, part, index, n_cells, hits):
+    """Join rows, in place; `left` says afterwards which are left. Old ones join only in voxels from `first` to `last`.
+
+    Args:
+        rows, gained, n_old, source, fine_m: See `add_sparing`; the rows have the samples.
+        index, n_cells: Of the rows.
+        hits: Cells with hits in them, of any source.
+    """
     voxel, kind, sums, sources = rows
-    hit_cells = np.empty(len(kind), np.int64)  # free voxels with hits in them, of any source
-    n_hit_cells = 0
+    has_hit = np.zeros(n_cells, np.bool_)
     for r in range(len(kind)):
         if kind[r] == HIT:
-            key = pack(0, voxel[r, 0] >> 1, voxel[r, 1] >> 1, voxel[r, 2] >> 1)
-            n_hit_cells = max(n_hit_cells, enter(hit_table, hit_cells, n_hit_cells, key) + 1)
+            has_hit[index.number[r]] = True
     for r in range(len(kind)):
         w = sums[r, 3]
         is_old = r < n_old
@@ -100,22 +107,22 @@ def _join_light(rows, gained, left, n_old, source, fine_m, first, last, part, ta
                 continue
             if not _is_between(voxel[r], 1 if is_hit else 0, first, last):
                 continue
-        label, edge = np.int64(kind[r]), 0.5 * fine_m if is_hit else fine_m
-        if not is_hit and any_around(hit_table, hit_cells, 0, voxel[r], 0):
+        edge = 0.5 * fine_m if is_hit else fine_m
+        if not is_hit and has_hit[index.number[r]]:
             continue
         factor = _BESIDE_HITS
         if not is_hit:
             if is_old:
                 factor = _OLD_FREE
-            elif not any_around(hit_table, hit_cells, 0, voxel[r], _CLEAR):
+            elif not _any_hits(voxel[r], _CLEAR, hits, has_hit, index):
                 factor = _BESIDE_IN_THE_CLEAR
-        to = _nearest_around(table, keys, voxel, sums, left, edge, r, label, 1, factor * w)
+        to = _nearest_around(rows, left, edge, r, 1, factor * w, index)
         if (
             to < 0
             and factor == _BESIDE_IN_THE_CLEAR
-            and not any_around(hit_table, hit_cells, 0, voxel[r], _WIDE_CLEAR)
+            and not _any_hits(voxel[r], _WIDE_CLEAR, hits, has_hit, index)
         ):
-            to = _nearest_around(table, keys, voxel, sums, left, edge, r, label, 2, _AWAY_IN_THE_CLEAR * w)
+            to = _nearest_around(rows, left, edge, r, 2, _AWAY_IN_THE_CLEAR * w, index)
         if to < 0:
             continue
         for c in range(3):
@@ -123,6 +130,23 @@ def _join_light(rows, gained, left, n_old, source, fine_m, first, last, part, ta
         sums[to, 3] += w
         gained[to] += gained[r]
         left[r] = False
+
+
+@nb.njit(nogil=True, error_model="numpy", cache=True)
+def _any_hits(cell, reach, hits, has_hit, index):
+    """Whether a cell, or one at most `reach` cells from it along each axis, has hits."""
+    if not may_be_around(hits, cell, reach):
+        return False
+    if hits.shift == 0:
+        return True  # the flags are of cells
+    keys, table = index.keys, index.table
+    for dx in range(-reach, reach + 1):
+        for dy in range(-reach, reach + 1):
+            for dz in range(-reach, reach + 1):
+                other = table[find(table, keys, pack(0, cell[0] + dx, cell[1] + dy, cell[2] + dz))]
+                if other >= 0 and has_hit[other]:
+                    return True
+    return False
 
 
 @nb.njit(nogil=True, error_model="numpy", cache=True)
@@ -136,21 +160,35 @@ def _is_between(voxel, shift, first, last):
 
 
 @nb.njit(nogil=True, error_model="numpy", cache=True)
-def _nearest_around(table, keys, voxel, sums, left, edge, r, label, reach, least_weight):
-    """Of the other rows of a label within `reach` voxels of row r, the nearest of at least such weight; -1 if there is none."""
+def _nearest_around(rows, left, edge, r, reach, least_weight, index):
+    """Of the other rows of its kind and source within `reach` voxels of row r, the nearest of at least such weight; or -1."""
+    voxel, kind, sums, sources = rows
+    _, following, head, keys, table = index
+    shift = np.int64(kind[r] & 1)
+    x, y, z = np.int64(voxel[r, 0]), np.int64(voxel[r, 1]), np.int64(voxel[r, 2])
     nearest = np.int64(-1)
     least = np.inf
-    for dx in range(-reach, reach + 1):
-        for dy in range(-reach, reach + 1):
-            for dz in range(-reach, reach + 1):
-                key = pack(label, voxel[r, 0] + dx, voxel[r, 1] + dy, voxel[r, 2] + dz)
-                q = np.int64(table[find(table, keys, key)])
-                if q < 0 or q == r or not left[q] or sums[q, 3] < least_weight:
+    for cx in range((x - reach) >> shift, ((x + reach) >> shift) + 1):
+        for cy in range((y - reach) >> shift, ((y + reach) >> shift) + 1):
+            for cz in range((z - reach) >> shift, ((z + reach) >> shift) + 1):
+                cell = table[find(table, keys, pack(0, cx, cy, cz))]
+                if cell < 0:
                     continue
-                d2 = 0.0
-                for c in range(3):
-                    off = sums[q, c] / sums[q, 3] - sums[r, c] / sums[r, 3]
-                    d2 += ((voxel[q, c] - voxel[r, c]) * edge + off) ** 2
-                if d2 < least:
-                    least, nearest = d2, q
+                q = head[cell]
+                while q >= 0:
+                    if (
+                        kind[q] == kind[r]
+                        and sources[q] == sources[r]
+                        and q != r
+                        and left[q]
+                        and sums[q, 3] >= least_weight
+                        and max(abs(voxel[q, 0] - x), abs(voxel[q, 1] - y), abs(voxel[q, 2] - z)) <= reach
+                    ):
+                        d2 = 0.0
+                        for c in range(3):
+                            off = sums[q, c] / sums[q, 3] - sums[r, c] / sums[r, 3]
+                            d2 += ((voxel[q, c] - voxel[r, c]) * edge + off) ** 2
+                        if d2 < least:
+                            least, nearest = d2, np.int64(q)
+                    q = following[q]
     return nearest

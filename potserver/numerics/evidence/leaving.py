@@ -21,10 +21,10 @@ from typing import NamedTuple
 import numba as nb
 import numpy as np
 
-from potserver.numerics.arrays import Bool, Float64, Int32, Int64, UInt8
+from potserver.numerics.arrays import Float64, Int32, Int64, UInt8
 from potserver.numerics.beams import Beams
 from potserver.numerics.evidence.rows import FREE, HIT, MISSED, PASSED, Rows, is_alive, positions
-from potserver.numerics.geometry import bounds
+from potserver.numerics.flag_grid import FlagGrid
 from potserver.numerics.threads import parallel_map, spans
 from potserver.numerics.voxel_hash import any_around, empty_table, find, pack
 
@@ -33,7 +33,7 @@ _ALONG = 2  # voxels: hits that a beam passes so near to each other share its on
 _PRIOR = 0.5  # of an echo, and of none: beams that each voxel has had before any were counted
 _ONE_SCAN = 3.0  # misses, at most: beams of one scan lie in the same ring, and miss a wire together
 _WALK = 0.75  # step of a walk along a beam, in voxels of hits
-_BLOCK_SHIFT, _MAX_BLOCKS = 1, 2**22  # blocks of 2^shift voxels of hits along an edge
+_BLOCK_SHIFT = 1  # blocks of 2^shift voxels of hits along an edge, at least
 _SPANS = 8  # of beams; the number of threads plays no part in how they are cut
 
 
@@ -56,16 +56,13 @@ class _Hits(NamedTuple):
     voxel: Int32  # (H, 3)
     table: Int32
     keys: Int64  # (H,)
-    corner: Int32  # (3,) voxel at the lower corner of the blocks
-    shift: int  # a block has 2^shift voxels along an edge
-    is_near: Bool  # (X, Y, Z) which blocks have hits
+    near: FlagGrid  # which blocks of voxels have hits: most of a beam's way leads through blocks without
 
     @staticmethod
     def of(voxel: Int32) -> _Hits:
         table = empty_table(len(voxel))
         keys = _enter_voxels(voxel, table)
-        corner, shift, is_near = _blocks_of(voxel)
-        return _Hits(voxel, table, keys, corner, shift, is_near)
+        return _Hits(voxel, table, keys, FlagGrid.of(voxel, _BLOCK_SHIFT))
 
 
 class _Passes(NamedTuple):
@@ -255,27 +252,13 @@ def _shares(voxel, hit, beam):
     return shares
 
 
-def _blocks_of(voxel: Int32) -> tuple[Int32, int, Bool]:
-    """Which blocks of 2^shift voxels along an edge hold any of (V, 3) voxels: their lower corner, the shift, a flag a block.
-
-    Most of a beam's way leads through blocks without hits, and a flag is looked up faster than a voxel.
-    """
-    corner, last = bounds(voxel)
-    shift = _BLOCK_SHIFT
-    while np.prod(((last - corner) >> shift).astype(np.float64) + 1.0) > _MAX_BLOCKS:
-        shift += 1
-    is_near = np.zeros(((last - corner) >> shift) + 1, bool)
-    is_near[tuple(((voxel - corner) >> shift).T)] = True
-    return corner, shift, is_near
-
-
 @nb.njit(nogil=True, error_model="numpy", cache=True)
 def _passes(ends, origin, hits, fine_m, found, beam):
     """How often beams pass through voxels with hits; which voxels and beams, as far as `found` and `beam` have room.
 
     The buffers do not grow in here: numba would count references in every step, which takes three times as long.
     """
-    table, keys, corner, shift, is_near = hits.table, hits.keys, hits.corner, hits.shift, hits.is_near
+    table, keys, (corner, shift, is_near) = hits.table, hits.keys, hits.near
     n = 0
     edge = 0.5 * fine_m
     ox, oy, oz = origin[0] / edge, origin[1] / edge, origin[2] / edge  # from here on in voxels

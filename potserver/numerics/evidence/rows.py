@@ -61,8 +61,10 @@ class Rows(NamedTuple):
         return Rows(*(np.concatenate(parts) for parts in zip(*sets, strict=True))) if sets else Rows.empty()
 
     def take(self, index: NDArray[np.intp] | Bool | slice) -> Rows:
-        """The rows that a numpy index picks."""
-        return Rows(self.voxel[index], self.kind[index], self.sums[index], self.source[index])
+        """The rows that a numpy index picks; a slice shares memory with them."""
+        if isinstance(index, slice):
+            return Rows(self.voxel[index], self.kind[index], self.sums[index], self.source[index])
+        return Rows(*_take(*self, np.flatnonzero(index) if index.dtype == np.bool_ else index))
 
     @property
     def occupied(self) -> Bool:
@@ -82,13 +84,23 @@ class Added(NamedTuple):
     weight: Float32  # (R,) what each row gained
 
 
+class CellIndex(NamedTuple):
+    """The cells that rows lie in, and the rows of each. A cell is a voxel of free space with the eight half ones in it."""
+
+    number: Int32  # (R,) the cell of each row
+    following: Int32  # (R,) the next row in the same cell; -1 after the last
+    head: Int32  # (C,) a first row of each cell
+    keys: Int64  # (C,) see `voxel_hash`
+    table: Int32
+
+
 class Filled(NamedTuple):
-    """Rows after samples were added, with the hash table (see `voxel_hash`) of one source's rows."""
+    """Rows after samples were added."""
 
     rows: Rows  # the old ones first, in their order
     weight: Float32  # (R,) what each row gained
-    table: Int32
-    keys: Int64  # one a row; undefined for rows of other sources
+    places: CellIndex
+    n_cells: int
 
 
 def add(
@@ -123,7 +135,7 @@ def fill(
     fine_m: float,
     source: int,
 ) -> Filled:
-    """`add`, for callers that go on looking for the source's rows by voxel."""
+    """`add`, for callers that go on looking for rows by cell."""
     n_old, n = len(rows.kind), len(points)
     voxel = np.empty((n_old + n, 3), np.int32)
     kinds = np.empty(n_old + n, np.uint8)
@@ -133,12 +145,31 @@ def fill(
     sources[:n_old] = rows.source
     room = Rows(voxel, kinds, sums, sources)
     gained = np.zeros(n_old + n, np.float32)
-    keys, table = np.empty(n_old + n, np.int64), empty_table(n_old + n)
-    used = _add(
+    index, n_cells = _index_of(rows, room_for=n)
+    used, n_cells = _add(
         room, gained, n_old, np.ascontiguousarray(points), np.asarray(kind, np.uint8), np.asarray(weight, np.float64),
-        fine_m, source, table, keys,
+        fine_m, source, index, n_cells,
     )  # fmt: skip
-    return Filled(room.take(slice(used)), gained[:used], table, keys)
+    index = index._replace(
+        number=index.number[:used],
+        following=index.following[:used],
+        head=index.head[:n_cells],
+        keys=index.keys[:n_cells],
+    )
+    return Filled(room.take(slice(used)), gained[:used], index, n_cells)
+
+
+def _index_of(rows: Rows, *, room_for: int = 0) -> tuple[CellIndex, int]:
+    """The cells of rows, with room for more rows and their cells; and how many cells there are."""
+    size = len(rows.kind) + room_for
+    index = CellIndex(
+        number=np.empty(size, np.int32),
+        following=np.empty(size, np.int32),
+        head=np.empty(size, np.int32),
+        keys=np.empty(size, np.int64),
+        table=empty_table(_n_runs(rows.voxel, rows.kind) + room_for),
+    )
+    return index, _enter_cells(rows.voxel, rows.kind, index)
 
 
 def positions(rows: Rows, fine_m: float) -> Float64:
@@ -200,14 +231,14 @@ def _tile_of(voxel, kind, voxels, size):
 class Cells(NamedTuple):
     """The cell of each row: a voxel of free space and the voxels of hits in it. Evidence saturates and is forgotten by cell."""
 
-    number: Int64  # (R,) from 0
+    number: Int32  # (R,) from 0
     n: int
 
 
 def cells(rows: Rows) -> Cells:
     """Number the cells that have rows."""
-    number, n = _cells(rows.voxel, rows.kind, empty_table(len(rows.kind)))
-    return Cells(number, n)
+    index, n = _index_of(rows)
+    return Cells(index.number, n)
 
 
 def forget(rows: Rows, gained: Float32, cells: Cells, limit: float) -> None:
@@ -228,13 +259,7 @@ def counts(rows: Rows, cells: Cells, saturation: float) -> Float32:
     Looks at one place repeat each other. So a cell counts for less than `saturation` looks, shared among its rows by weight.
     Shadows count a part of a look where nothing in their cell was seen to be free, and nothing elsewhere; tallies never count.
     """
-    is_shadow = rows.kind == SHADOW
-    is_seen = is_label(rows) & ~is_shadow
-    weight = np.where(is_seen, np.maximum(rows.sums[:, 3], np.float32(0)), np.float32(0))
-    total = np.bincount(cells.number, weight, cells.n)[cells.number]
-    free = np.bincount(cells.number, np.where(rows.kind == HIT, np.float32(0), weight), cells.n)[cells.number]
-    shadow = np.where(free < _SEEN, np.float32(_SHADOW_COUNT), np.float32(0))
-    return np.where(is_shadow, shadow, weight / (1.0 + total / saturation)).astype(np.float32)
+    return np.asarray(_counts(rows.kind, rows.sums, cells.number, cells.n, saturation), np.float32)
 
 
 def clip(rows: Rows, memory: float) -> None:
@@ -256,55 +281,120 @@ def decay(rows: Rows, factor: float) -> Rows:
 
 
 @nb.njit(nogil=True, error_model="numpy", cache=True)
-def _add(rows, gained, n, points, kind, weight, fine_m, source, table, keys):
-    """Fill `rows` from row n on, in place, and `table` and `keys` with the source's rows; how many rows are used."""
-    voxel, kinds, sums, sources = rows
-    for r in range(n):
-        if sources[r] == source:
-            keys[r] = pack(kinds[r], voxel[r, 0], voxel[r, 1], voxel[r, 2])
-            table[find(table, keys, keys[r])] = r
-    cell = np.empty(3, np.int64)
-    for i in range(len(points)):
-        edge = 0.5 * fine_m if kind[i] & 1 else fine_m
+def _take(voxel, kind, sums, source, index):
+    n = len(index)
+    out_voxel, out_kind = np.empty((n, 3), np.int32), np.empty(n, np.uint8)
+    out_sums, out_source = np.empty((n, 4), np.float32), np.empty(n, np.int16)
+    for i in range(n):
+        r = index[i]
+        out_kind[i], out_source[i] = kind[r], source[r]
         for c in range(3):
-            cell[c] = np.int64(np.floor(points[i, c] / edge))
-        key = pack(kind[i], cell[0], cell[1], cell[2])
+            out_voxel[i, c] = voxel[r, c]
+        for c in range(4):
+            out_sums[i, c] = sums[r, c]
+    return out_voxel, out_kind, out_sums, out_source
+
+
+@nb.njit(nogil=True, error_model="numpy", cache=True)
+def _n_runs(voxel, kind):
+    """Runs of rows of one cell, which are no fewer than cells."""
+    n, last = 0, np.int64(-1)
+    for r in range(len(kind)):
+        shift = kind[r] & 1
+        key = pack(0, voxel[r, 0] >> shift, voxel[r, 1] >> shift, voxel[r, 2] >> shift)
+        n += key != last
+        last = key
+    return n
+
+
+@nb.njit(nogil=True, error_model="numpy", cache=True)
+def _enter_cells(voxel, kind, index):
+    """Enter rows into an index that has room for them, in place; how many cells they lie in.
+
+    A cell is looked up once a run of its rows; in tiles that is once.
+    """
+    number, following, head, keys, table = index
+    n, cell, last = 0, np.int64(-1), np.int64(-1)
+    for r in range(len(kind)):
+        shift = kind[r] & 1
+        key = pack(0, voxel[r, 0] >> shift, voxel[r, 1] >> shift, voxel[r, 2] >> shift)
+        if key != last:
+            cell = enter(table, keys, n, key)
+            if cell == n:
+                head[n] = -1
+                n += 1
+            last = key
+        number[r] = cell
+        following[r] = head[cell]
+        head[cell] = r
+    return n
+
+
+@nb.njit(nogil=True, error_model="numpy", cache=True)
+def _add(rows, gained, n, points, kind, weight, fine_m, source, index, n_cells):
+    """Fill `rows` from row n on, in place, with the index; how many rows and cells are used."""
+    voxel, kinds, sums, sources = rows
+    number, following, head, keys, table = index
+    at = np.empty(3, np.int64)
+    for i in range(len(points)):
+        k = kind[i]
+        edge = 0.5 * fine_m if k & 1 else fine_m
+        for c in range(3):
+            at[c] = np.int64(np.floor(points[i, c] / edge))
+        key = pack(0, at[0] >> (k & 1), at[1] >> (k & 1), at[2] >> (k & 1))
         place = find(table, keys, key)
-        r = table[place]
-        if r < 0:
-            if weight[i] <= 0.0:
-                continue  # nothing to take off
-            r = n
-            table[place] = r
-            keys[r] = key
-            kinds[r] = kind[i]
-            for c in range(3):
-                voxel[r, c] = cell[c]
-            n += 1
+        cell = table[place]
+        r = np.int32(-1) if cell < 0 else head[cell]
+        while r >= 0 and not (
+            kinds[r] == k
+            and sources[r] == source
+            and voxel[r, 0] == at[0]
+            and voxel[r, 1] == at[1]
+            and voxel[r, 2] == at[2]
+        ):
+            r = following[r]
         w = weight[i]
+        if r < 0:
+            if w <= 0.0:
+                continue  # nothing to take off
+            if cell < 0:
+                cell = n_cells
+                table[place], keys[cell], head[cell] = cell, key, -1
+                n_cells += 1
+            r = n
+            number[r], following[r], head[cell] = cell, head[cell], r
+            kinds[r] = k
+            for c in range(3):
+                voxel[r, c] = at[c]
+            n += 1
         if w < 0.0 and sums[r, 3] + w <= _LEAST_WEIGHT:
             gained[r] -= sums[r, 3]
             sums[r, :] = 0.0
             continue
         for c in range(3):
-            sums[r, c] += w * (points[i, c] - (cell[c] + 0.5) * edge)
+            sums[r, c] += w * (points[i, c] - (at[c] + 0.5) * edge)
         sums[r, 3] += w
         gained[r] += w
-    return n
+    return n, n_cells
 
 
 @nb.njit(nogil=True, error_model="numpy", cache=True)
-def _cells(voxel, kind, table):
-    n_rows = len(kind)
-    number = np.empty(n_rows, np.int64)
-    keys = np.empty(n_rows, np.int64)
-    n = 0
-    for r in range(n_rows):
-        shift = kind[r] & 1
-        key = pack(0, voxel[r, 0] >> shift, voxel[r, 1] >> shift, voxel[r, 2] >> shift)
-        number[r] = enter(table, keys, n, key)
-        n = max(n, number[r] + 1)
-    return number, n
+def _counts(kind, sums, cell, n_cells, saturation):
+    total, free = np.zeros(n_cells), np.zeros(n_cells)
+    for r in range(len(kind)):
+        if kind[r] < PASSED and kind[r] != SHADOW:
+            weight = max(sums[r, 3], np.float32(0))
+            total[cell[r]] += weight
+            if kind[r] != HIT:
+                free[cell[r]] += weight
+    out = np.zeros(len(kind), np.float32)
+    for r in range(len(kind)):
+        if kind[r] == SHADOW:
+            if free[cell[r]] < _SEEN:
+                out[r] = _SHADOW_COUNT
+        elif kind[r] < PASSED:
+            out[r] = max(sums[r, 3], np.float32(0)) / (1.0 + total[cell[r]] / saturation)
+    return out
 
 
 @nb.njit(nogil=True, error_model="numpy", cache=True)

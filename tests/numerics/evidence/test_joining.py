@@ -142,7 +142,7 @@ def test_robots_that_take_turns_get_to_all_their_oldrows_of(robots: int) -> None
     none = np.zeros((0, 3)), np.zeros(0, bool), np.zeros(0)
     for turn in range(0, 3 * robots * TURNS, robots):
         before = len(rows.occupied)
-        rows, _, n_old = add_sparing(
+        rows, _, n_old, _ = add_sparing(
             rows, *none, FINE_M, within=(np.full(3, -9.0), np.full(3, 9.0)), turn=turn
         )
         assert before - n_old < 0.5 * len(light)
