@@ -65,7 +65,7 @@ class RePotPipeline(PotPipeline):
         labels = seen.labelled.occupied.astype(np.uint8)
         samples = Samples(points - region.origin_m, labels, beam_weights(seen.labelled))
         add_evidence(region, samples, source, turn=moment.revision)
-        new = MapKernels.new(own.prior.moved(-region.origin_m), CARRIED)
+        new = MapKernels.new(self.joining(own, region, samples, seen.scan.is_planar), CARRIED)
         region.kernels = MapKernels.concatenate([region.kernels, new])
         effort = self.method.effort
         solver = Solver(effort.newton_steps, effort.gradient_steps, _LONGEST_STEP)
@@ -73,6 +73,10 @@ class RePotPipeline(PotPipeline):
         solved = _solve(region, *box, solver, threads=self.threads)
         tiles = region.tiles(lower, upper, revision=moment.revision, stamp_ns=moment.stamp_ns)
         return Fused(tiles, len(new), len(new), solved)
+
+    def joining(self, own: ScanMap, region: Region, samples: Samples, planar: bool) -> KernelSet:
+        """The kernels that the map takes with a scan, in the region's frame: all that was carried."""
+        return own.prior.moved(-region.origin_m)
 
 
 class FlatRePotPipeline(RePotPipeline):
