@@ -94,7 +94,6 @@ def _most(
 
 def _cost_ms(mapper: Mapper, scans: list[tuple[int, RecordedScan]]) -> float:
     """Processor ms a scan, median, of a map that is thrown away."""
-    mapper.warm_up(planar=scans[0][1].is_planar)
     spent = []
     for _, scan in scans:
         start = time.process_time()

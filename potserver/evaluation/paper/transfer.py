@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from statistics import fmean, pstdev
+from statistics import fmean, median, pstdev
 
 import numpy as np
 
@@ -136,7 +136,7 @@ def _mean_row(name: str, rows: list[Row]) -> Row:
     made: Row = {"map": name, "scans": len(rows)}
     for field in ("acc", "auc", "nll", "ece", "unknown", "kernels", "cpu_ms", "nll_authors_clip"):
         values = [row[field] for row in rows if not np.isnan(row[field])]
-        made[field] = fmean(values)
+        made[field] = median(values) if field == "cpu_ms" else fmean(values)
         made[f"{field}_sd"] = pstdev(values)
     return made
 

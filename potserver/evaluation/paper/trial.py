@@ -107,14 +107,11 @@ class Run(NamedTuple):
 def run_maps(
     maps: list[Mapper], scans: Iterator[tuple[int, RecordedScan]], on_scan: Callable[[], None] = lambda: None
 ) -> Run:
-    """Feed all maps the same scans, without a fifth of the beams."""
+    """Feed all maps the same scans, without a fifth of the beams. The first scan pays for what is compiled: see medians."""
     hold_out = HoldOut()
     labels: list[LabelledPoints] = []
     times: list[list[float]] = [[] for _ in maps]
     for number, scan in scans:
-        if not labels:
-            for mapper in maps:
-                mapper.warm_up(planar=scan.is_planar)
         given, kept_back = hold_out.split(scan, number)
         labels.append(kept_back)
         for mapper, spent in zip(maps, times, strict=True):
