@@ -71,7 +71,7 @@ def run(options: argparse.Namespace) -> int:
     console = results_console(_COLUMNS)
     if not options.tables and not options.all_tables:
         lines = [[name, made.title, f"{made.minutes} min"] for name, made in TABLES.items()]
-        console.print(table(["table", "what it shows", "at full size, about"], lines, left=(0, 1)))
+        console.print(table(["table", "what it shows", "at full size, by estimate"], lines, left=(0, 1)))
         return EXIT_OK
     for name in TABLES if options.all_tables else options.tables:
         if name not in TABLES:

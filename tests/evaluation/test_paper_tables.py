@@ -89,6 +89,9 @@ def test_tables_are_listed_and_wrong_words_refused(
     assert cli.main(["eval", "paper"]) == 0
     listed = capsys.readouterr().out
     assert all(name in listed for name in TABLES)
+    few = ["eval", "paper", "--quick", "--table", "ranking", "--only", "no such cell", "--out", str(tmp_path)]
+    assert cli.main(few) == 0
+    assert not (tmp_path / "ranking.json").exists(), "nothing ran"
     for wrong in (
         ["paper", "--table", "nothing"],
         ["paper", "--table", "towns", "--size", "huge"],
