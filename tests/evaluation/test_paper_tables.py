@@ -18,9 +18,17 @@ from potserver.errors import SettingsError
 from potserver.evaluation.mappers import Answer
 from potserver.evaluation.paper import mass, rivalry
 from potserver.evaluation.paper.rivals import AbhmPipeline, BhmPipeline
-from potserver.evaluation.paper.scenes import KITTI, KITTI_RING, TOWNS_2D, LevelRing, NoDataError, open_scene
+from potserver.evaluation.paper.scenes import (
+    KITTI,
+    KITTI_RING,
+    TOWNS_2D,
+    LevelRing,
+    NoDataError,
+    Scene,
+    open_scene,
+)
 from potserver.evaluation.paper.shipped import authors_refined
-from potserver.evaluation.paper.sizes import QUICK, SMALL
+from potserver.evaluation.paper.sizes import FULL, QUICK, SMALL
 from potserver.evaluation.paper.sources import Sources
 from potserver.evaluation.paper.table import Cell, Found, Lab, Results, Shown, Table
 from potserver.evaluation.paper.tables import TABLES
@@ -123,7 +131,7 @@ def test_cells_without_data_are_left_out_with_the_reason(tmp_path: Path) -> None
     assert "--data" in results.missing["Town 1 to Town 1, as shipped"]
     for scene in (KITTI, KITTI_RING):
         with pytest.raises(NoDataError):
-            open_scene(scene, tmp_path)
+            open_scene(scene, tmp_path, 100)
 
 
 def _table(cells: list[Cell]) -> Table:
@@ -276,6 +284,31 @@ def test_the_authors_nll_has_their_clip() -> None:
     row = scored(Answer(np.array([0.0, 0.0]), np.ones(2, bool)), labels)
     assert row["nll_authors_clip"] == pytest.approx(-np.log(1e-15) / 2)
     assert row["nll"] == pytest.approx(-np.log(1e-6) / 2, rel=1e-5)
+
+
+def test_a_smaller_pool_is_part_of_a_larger_one_and_both_lie_along_the_drives(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    taken = {}
+
+    def learned(sources: Sources, scene: Scene, frames: range) -> list:
+        taken[scene.name] = frames
+        points = np.ones((3, 3), np.float32)
+        kernels = reference.kernels_at(points, np.random.default_rng(0))
+        return [
+            reference.atom(f"{scene.key}-{n}-{s}", points, points, kernels, dims=2)
+            for n in frames
+            for s in range(4)
+        ]
+
+    monkeypatch.setattr(Sources, "_learned", learned)
+    sources = Sources(tmp_path, None, FULL, 2)
+    pool = [atom.atom_id for atom in sources.pool(TOWNS_2D[:2], 600)]
+    assert len(pool) == len(set(pool)) == 600
+    assert pool == [atom.atom_id for atom in sources.pool(TOWNS_2D[:2], 600)], "the order is drawn once"
+    for scene in TOWNS_2D[:2]:
+        n_scans = len(open_scene(scene, None, FULL.drive))
+        assert 0.9 * n_scans < max(taken[scene.name]) < n_scans
 
 
 def test_atoms_are_learned_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -84,12 +84,13 @@ class LevelRing(Recording):
         )
 
 
-def open_scene(scene: Scene, data: Path | None) -> Recording:
+def open_scene(scene: Scene, data: Path | None, drive: int) -> Recording:
     """A domain's scans, with beams cut at 20 m.
 
     Args:
         scene: Which.
         data: Folder of the recordings; none: there are none.
+        drive: Scans of a town, at 10 Hz.
     Raises:
         NoDataError: it is a recording, and it is not there.
     """
@@ -99,6 +100,6 @@ def open_scene(scene: Scene, data: Path | None) -> Recording:
         if path is None or not path.exists():
             raise NoDataError(f"no {dataset} in the folder of --data")
         dataset = str(path)
-    reader = Reader(min_range_m=scene.min_range_m, max_range_m=REACH_M)
+    reader = Reader(min_range_m=scene.min_range_m, max_range_m=REACH_M, n_generated=drive)
     recording = open_recording(dataset, reader)
     return LevelRing(recording) if scene.is_ring else recording

@@ -47,7 +47,8 @@ class Sources(NamedTuple):
         a_scene = -(-n_atoms // (len(scenes) * (_N_SECTORS - 1)))
         atoms: list[Atom] = []
         for scene in scenes:
-            spread = range(0, 40 * a_scene, 40)
+            n_scans = len(open_scene(scene, self.data, self.size.drive))
+            spread = range(0, n_scans, max(1, n_scans // a_scene))[:a_scene]
             atoms += self._kept(f"{scene.key}-along-{a_scene}", scene, spread).atoms
         order = np.random.default_rng(0).permutation(len(atoms))
         return AtomDictionary(atoms[i] for i in order)
@@ -60,12 +61,12 @@ class Sources(NamedTuple):
         return AtomDictionary.load(path)
 
     def _learned(self, scene: Scene, frames: range) -> list[Atom]:
-        recording = open_scene(scene, self.data)
+        recording = open_scene(scene, self.data, self.size.drive)
         values = {"n_sectors": _N_SECTORS, "max_range_m": REACH_M}
         values |= _OF_PLAN if scene.planar else {}
         settings = LearningSettings(**(values | self.size.learner))
         atoms: list[Atom] = []
-        for number in frames[: len(recording)]:
+        for number in frames:
             provenance = {"dataset": scene.dataset, "scan": str(number), "licence": "not for distribution"}
             atoms += learn_atoms(
                 to_scan(recording[number], number), f"{scene.key}-{number}", settings, provenance, seed=number,

@@ -63,7 +63,7 @@ def scans_of(
     Raises:
         NoDataError: the recording is not there.
     """
-    recording = open_scene(scene, data)
+    recording = open_scene(scene, data, size.drive)
     numbers = range(len(recording))[scene.first if first is None else first :: scene.every]
     for number in numbers[: size.scans]:
         scan = recording[number]
