@@ -94,7 +94,7 @@ def _solve(region: Region, lower: Float64, upper: Float64, solver: Solver, *, th
     """
     fine_m, kernels = region.grid.fine_m, region.kernels
     where = evidence.positions(region.rows, fine_m)
-    counts = evidence.counts(region.rows, evidence.cells(region.rows), _SATURATION)
+    counts = evidence.counts(region.rows, region.cells or evidence.cells(region.rows), _SATURATION)
     rows = np.flatnonzero(inside_box(where, lower - _REACH_M, upper + _REACH_M) & (counts > 0.0))
     hinge = kernels.kernels.hinge_mean
     local = np.flatnonzero(inside_box(hinge, lower - 2 * _REACH_M, upper + 2 * _REACH_M))
