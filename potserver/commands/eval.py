@@ -49,7 +49,7 @@ and harm N.
 
 Towns and the gauntlet (doorways, poles and wires) are asked about their exact truth too. Times are of maps that take
 turns, scan by scan, in this process.
---peers needs `pip install 'potserver[peers]'` for OctoMap."""
+--peers needs the extra `peers` for OctoMap."""
 
 _EXAMPLES = """\
 examples:

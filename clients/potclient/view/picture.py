@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from potclient.arrays import Bool, Float64
 from potclient.cells import CellBox
 from potclient.errors import UsageError
+from potclient.extras import how_to_install
 from potclient.mesh import mesh_of, sd_colours
 from potclient.occupancy import Grid
 from potclient.watched import WatchedCloud
@@ -50,7 +51,7 @@ class MapPicture:
         try:
             import rerun
         except ImportError as error:
-            raise UsageError("the view needs the package rerun-sdk: pip install 'potserver[view]'") from error
+            raise UsageError(f"the view needs the package rerun-sdk: {how_to_install('view')}") from error
         self._rr: Any = rerun
         self.recording: Any = rerun.RecordingStream("potclient", send_properties=True)
         self.recording.send_recording_name(name)
