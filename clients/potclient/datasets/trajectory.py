@@ -46,7 +46,7 @@ def read_trajectory(path: Path) -> Trajectory:
 
     - KITTI: 12 numbers a line (the top three rows of the matrix) or 16, row-major;
     - TUM: `stamp tx ty tz qx qy qz qw`, the stamp in seconds;
-    - NCLT's ground truth: `utime, x, y, z, roll, pitch, heading`, us, m and radians, of the body in north, east, down. The map is
+    - NCLT's ground truth: `utime, x, y, z, roll, pitch, heading`, us, m, radians, of the body in north, east, down. The map is
       turned to north, west, up; lines without numbers (nan) are left out, and `form` counts them;
     - a graph's vertices: `v0 x y z qx qy qz qw`, or g2o's `VERTEX_SE3:QUAT 0 x y z qx qy qz qw`, in order of their numbers.
 
