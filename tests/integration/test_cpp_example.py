@@ -1,6 +1,6 @@
 """The client in C++ (clients/examples/cpp): its messages against the golden vectors, and its robot against a real server.
 
-Needs cmake, a C++ compiler and msgpack-cxx; the robot also zenoh-cpp, found by CMAKE_PREFIX_PATH. What is missing is named in a skip.
+Needs cmake, a C++ compiler and msgpack-cxx, and for the robot zenoh-cpp at CMAKE_PREFIX_PATH; skips name what is missing.
 """
 
 from __future__ import annotations

@@ -32,7 +32,7 @@ class Block(NamedTuple):
 
 
 def documents(root: Path) -> list[Path]:
-    names = ("docs", "docs/decisions", "schemas", "benchmarks", "clients", "docker", ".github")
+    names = ("docs", "docs/decisions", "docs/guides", "schemas", "benchmarks", "clients", "docker", ".github")
     folders = (root, *(root / name for name in names))
     return sorted(path for folder in folders for path in folder.glob("*.md"))
 
