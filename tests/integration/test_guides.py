@@ -1,4 +1,4 @@
-"""Every command of the guides (docs/guides), in order as a reader runs them, in a folder with what the guide takes for granted."""
+"""Every command of the guides (docs/guides), in order, as a reader runs them, beside the files that a guide begins with."""
 
 from __future__ import annotations
 
