@@ -156,7 +156,7 @@ def test_what_is_wrong_is_said(served: MapServer, client: MapClient) -> None:
 
 WIDTH, HEIGHT, PAGE_S = 800, 500, 120.0
 RIGHT_ARROW = ("ArrowRight", 39)
-INSIDE = ((300, 180), (400, 250))  # pixels where the slice is
+INSIDE = ((170, 180), (250, 240))  # pixels where the slice is
 
 
 @pytest.fixture
