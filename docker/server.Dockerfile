@@ -1,6 +1,6 @@
 # docker build -f docker/server.Dockerfile -t potserver:0.1.0 .
 FROM python:3.11-slim-bookworm AS build
-# Where pip looks, if not in its default place: torch there may be the CUDA build, of several GB, and a CPU build is enough.
+# Where pip looks, if not in its default place.
 ARG PIP_INDEX_URL=
 ARG PIP_EXTRA_INDEX_URL=
 ENV PIP_NO_CACHE_DIR=1 PIP_DISABLE_PIP_VERSION_CHECK=1
@@ -13,9 +13,6 @@ COPY schemas schemas
 RUN /opt/potserver/bin/pip install -q -c constraints.txt '.[ros]'
 
 FROM python:3.11-slim-bookworm
-# what open3d links to
-RUN apt-get update && apt-get install -y --no-install-recommends libgl1 libgomp1 libudev1 libx11-6 \
-    && rm -rf /var/lib/apt/lists/*
 RUN useradd --system --uid 10001 --create-home --home-dir /var/lib/potserver potserver
 COPY --from=build /opt/potserver /opt/potserver
 ENV PATH=/opt/potserver/bin:$PATH NUMBA_CACHE_DIR=/var/lib/potserver/numba-cache

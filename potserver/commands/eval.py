@@ -50,7 +50,7 @@ and harm N.
 
 Towns and the gauntlet (doorways, poles and wires) are asked about their exact truth too. Times are of maps that take
 turns, scan by scan, in this process.
---peers needs `pip install 'potserver[peers]'` for OctoMap.
+--peers needs the extra `peers` for OctoMap.
 
 `potserver eval paper` is another thing: the tables of the paper and of its text, on made-up towns in 2D and 3D and on
 recordings, the paper's figures beside ours. It lists them; --table runs one. What was found is kept in --out, and a run
