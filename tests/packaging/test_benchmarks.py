@@ -15,6 +15,7 @@ import pytest
         "fairness",
         "ghosts",
         "kill",
+        "kilometre",
         "laps",
         "lattices",
         "learner_curves",
