@@ -181,7 +181,8 @@ class MapWriter:
             check_not_future(scan.stamp_ns, self._bounds.max_future_s)
             self._order.check(scan.robot_id, scan.session, scan.seq)
             started_s = time.perf_counter()
-            update = self._mapper.integrate(scan, commit=lambda: self._keeper.append(scan))
+            with self._keeper.keeping(scan) as commit:
+                update = self._mapper.integrate(scan, commit=commit)
         except PotserverError as error:
             if not (isinstance(error, PoseNotYetError) and self._waits(job, error)):
                 self._receipts.refuse(job, error)
