@@ -108,7 +108,7 @@ class Journal:
         return self._head.pruned
 
     def stage(self, cloud: bytes, *, prune_to: int, check: Callable[[], None] = lambda: None) -> None:
-        """Write a scan, on the disk when this returns, that does not count before `count_staged`; one that never did makes room.
+        """Write a scan, on the disk when this returns, that does not count before `count_staged`. One that never did goes.
 
         Args:
             cloud: The scan as `pot.cloud.v1`, with pose and robot.
