@@ -33,7 +33,7 @@ from potserver.health import Health
 from potserver.mapping.service import MappingService
 from potserver.mapping.settings import MappingSettings
 from potserver.storage.agreement import JOURNAL, MARK, TILES
-from potserver.storage.journal import Journal, scans_after
+from potserver.storage.journal import Journal
 from potserver.storage.map_file import MapFile, Origin, read_map, write_map
 from potserver.storage.map_store import MapStore, MemoryOnly, Restored
 from potserver.storage.seal import sealed, unsealed
@@ -272,28 +272,6 @@ def test_a_scan_that_the_disk_refuses_is_not_in_the_map(tmp_path: Path, open_map
     ours.take(make_scan(2))
     again = open_map(ours.crash(tmp_path / "copy"))
     assert_same_map(ours.state, again.state)
-
-
-def test_a_scan_counts_only_when_it_enters_the_map(tmp_path: Path, open_map: OpenMap) -> None:
-    """Its bytes are on the disk before; a crash, an error in the middle, or the next scan forget them."""
-    ours = open_map(tmp_path / "store")
-    ours.take(make_scan(1))
-    with pytest.raises(RuntimeError, match="in the middle"), ours.store.keeping(make_scan(7)):
-        raise RuntimeError("in the middle")
-    with ours.store.keeping(make_scan(8)):
-        pass  # never committed; staged when the block has ended
-    left = ours.crash(tmp_path / "left")
-    assert scans_after(left / "default" / JOURNAL, 0) == 1
-    again = open_map(left)
-    assert (again.state.n_scans, again.restored.n_replayed) == (1, 1)
-    again.take(make_scan(2))
-    ours.take(make_scan(2))
-    for journal in (ours.crash(tmp_path / "more"), again.crash(tmp_path / "others")):
-        restored = open_map(journal)
-        assert (restored.state.n_scans, restored.restored.n_replayed) == (2, 2)
-    ours.store.close()
-    with contextlib.closing(sqlite3.connect(tmp_path / "store" / "default" / JOURNAL)) as connection:
-        assert connection.execute("SELECT COUNT(*) FROM scans").fetchone() == (0,)
 
 
 def test_a_snapshot_that_the_disk_refuses_leaves_the_journal_whole(tmp_path: Path, open_map: OpenMap) -> None:
