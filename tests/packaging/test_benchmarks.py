@@ -22,6 +22,7 @@ import pytest
         "mirror",
         "service",
         "sessions",
+        "standing",
         "torture",
     ],
 )
