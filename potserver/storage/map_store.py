@@ -56,7 +56,7 @@ log = get_logger("potserver.store")
 Commit = Callable[[], None]  # the scan counts from when it returns
 
 SAVED = "saved"
-SNAPSHOT_SCANS = 50  # a restart integrates at most so many again: seconds
+SNAPSHOT_SCANS = 16  # a restart after a crash integrates at most so many again: seconds
 SNAPSHOT_BYTES = 64 * 2**20  # large scans make a snapshot due earlier
 MAX_SAVED = 100  # copies with a name: whoever reaches the server may ask for one more
 _REPORT_S = 2.0  # between two lines of progress
