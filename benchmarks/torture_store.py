@@ -104,7 +104,8 @@ class Driven:
         if kind == "t":
             scan = make_scan(number)
             self.order.check(scan.robot_id, scan.session, scan.seq)
-            self.mapper.integrate(scan, commit=lambda: self.store.append(scan))
+            with self.store.keeping(scan) as commit:
+                self.mapper.integrate(scan, commit=commit)
             self.order.remember(scan.robot_id, scan.session, scan.seq)
             self.store.advance(self.mapper, self.order.heard)
         elif kind == "c":

@@ -10,6 +10,7 @@ from potclient.mirror import Ask
 from potschemas import messages, wire
 from potschemas.answers import AnswerRule
 from potserver.adapters.questions.tiles import decode_tiles, encode_part
+from potserver.asking.tile_codes import TileMemory
 from potserver.domain.kernel_map import KernelMap
 from potserver.domain.map_state import MapState
 from potserver.domain.tiles import COARSE, MapKernels, Tile, TiledMap, TileGrid, TileIndex
@@ -69,11 +70,16 @@ def tiled_state(
 
 
 def parts_about(
-    state: MapState, query: messages.TilesQuery, part_kernels: int = 20_000
+    state: MapState,
+    query: messages.TilesQuery,
+    part_kernels: int = 20_000,
+    memory: TileMemory | None = None,
 ) -> list[messages.TilesPart]:
     """What a server that holds this map answers."""
     asked = decode_tiles(wire.decode(wire.encode(query), messages.TilesQuery))
-    plan = asked.plan(state, Limits(), tile_size_m=GRID.size_m, part_kernels=part_kernels)
+    plan = asked.plan(
+        state, Limits(), memory or TileMemory(), tile_size_m=GRID.size_m, part_kernels=part_kernels
+    )
     parts = [encode_part(plan, number, run) for number, run in enumerate(plan.parts())]
     return [wire.decode(wire.encode(part), messages.TilesPart) for part in parts]
 
@@ -83,11 +89,13 @@ def asking(
     *,
     part_kernels: int = 20_000,
     spoil: Callable[[list[messages.TilesPart]], Iterable[messages.TilesPart]] = lambda parts: parts,
+    memory: TileMemory | None = None,
 ) -> Ask:
     """The server's side of a mirror; `spoil` may change the reply on its way."""
+    remembered = memory or TileMemory()
 
     def ask(query: messages.TilesQuery) -> Iterator[tuple[messages.TilesPart, int]]:
-        for part in spoil(parts_about(state_now(), query, part_kernels)):
+        for part in spoil(parts_about(state_now(), query, part_kernels, remembered)):
             yield part, len(wire.encode(part))
 
     return ask

@@ -28,7 +28,7 @@ from potclient.questions.grid import ProgressCallback
 from potclient.questions.points import PointsQuestion
 from potclient.questions.rays import Rays
 from potclient.questions.risk import Risk
-from potclient.questions.tiles import MIRROR_MARGIN_M
+from potclient.questions.tiles import MIRROR_MARGIN_M, MIRROR_STEP
 from potclient.results import FeedCounts, Receipt, TransportedParams
 from potclient.session import SessionOptions
 from potclient.watched import WatchedCloud, watch_clouds
@@ -419,7 +419,7 @@ class MapClient:
         upper: ArrayLike | None = None,
         *,
         margin_m: float = MIRROR_MARGIN_M,
-        mantissa_bits: int | None = None,
+        step: float | None = MIRROR_STEP,
         timeout_s: float | None = None,
     ) -> MapMirror:
         """A copy of the map, or of a box of it, to ask without the server; its `update` fetches the tiles that changed.
@@ -430,18 +430,19 @@ class MapClient:
         Args:
             lower, upper: (3,) m, map frame: corners of the box; None = the whole map.
             margin_m: By which a box is widened. Kernels carried from atoms may reach farther than the default.
-            mantissa_bits: Round the weights to 2 to 23 bits to save bytes; None = as they are. With b bits each weight is off
-                by at most 2^-(b + 1) of itself, the latent mean by that share of sum_m |weight_mean_m| phi_m.
+            step: Means of weights come as multiples of it, log-odds, and variances in steps of three times that share of
+                themselves: few bytes then tell what has changed. At the default a probability is within .02 of the server's,
+                but for points at the edge of what is known. None = exact, at eight times the bytes.
             timeout_s: Of one update; None takes the client's.
         Raises:
-            UsageError: an illegal box, margin or number of bits.
+            UsageError: an illegal box, margin or step.
         """
         return tiles.mirror(
             self._link,
             lower,
             upper,
             margin_m=margin_m,
-            mantissa_bits=mantissa_bits,
+            step=step,
             timeout_s=timeout_s,
         )
 

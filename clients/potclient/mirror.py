@@ -17,8 +17,18 @@ from potclient.errors import BadReplyError, UsageError
 from potclient.kernels import KernelSet
 from potclient.occupancy import Occupancy
 from potclient.parts import PartCheck
+from potclient.tile_changes import Kernels, Steps, TileNodes, changed_nodes, kernels_of, steps_of
 from potschemas.answers import RULE_FIELDS, AnswerRule
-from potschemas.messages import MAX_PART_KERNELS, CodedKernels, DType, Packed, TilesPart, TilesQuery
+from potschemas.messages import (
+    ABSENT,
+    MAX_PART_KERNELS,
+    CodedKernels,
+    DType,
+    Packed,
+    TileChanges,
+    TilesPart,
+    TilesQuery,
+)
 from potschemas.wire import WireError, pack_array, unpack_array
 
 Int64 = NDArray[np.int64]
@@ -60,16 +70,17 @@ class MapMirror:
         lower: list[float] | None = None,
         upper: list[float] | None = None,
         *,
-        mantissa_bits: int | None = None,
+        step: float | None = None,
     ) -> None:
         """An empty mirror.
 
         Args:
             ask: Sends a query of tiles, and gives the parts of its reply.
             lower, upper: (3,) m, map frame: the tiles that this box touches are mirrored; None = no bound on that side.
-            mantissa_bits: Of the weights, see `MapClient.mirror`.
+            step: Of the weights, see `MapClient.mirror`.
         """
-        self._ask, self._lower, self._upper, self._mantissa_bits = ask, lower, upper, mantissa_bits
+        self._ask, self._lower, self._upper = ask, lower, upper
+        self._step = ABSENT if step is None else step
         self._updating = threading.Lock()
         self._state: _State | None = None
 
@@ -82,13 +93,13 @@ class MapMirror:
         """
         with self._updating:
             state = self._state
-            query = TilesQuery(lower=self._lower, upper=self._upper, mantissa_bits=self._mantissa_bits)
+            query = TilesQuery(lower=self._lower, upper=self._upper, step=self._step)
             if state is not None:
                 query = msgspec.structs.replace(query, epoch=state.epoch, known=pack_array(state.known))
-            reply = _Reply()
+            reply = _Reply(state)
             for part, n_bytes in self._ask(query):
                 reply.add(part, n_bytes)
-            self._state, update = reply.applied_to(state)
+            self._state, update = reply.applied()
             return update
 
     @property
@@ -122,6 +133,9 @@ class MapMirror:
         return self.kernels.occupancy(points, gradient=gradient)
 
 
+_NO_NODES: TileNodes = {}
+
+
 class _Tile(NamedTuple):
     revision: int
     hinge_mean: Float64  # (K, 3) m, map frame
@@ -130,9 +144,11 @@ class _Tile(NamedTuple):
     gamma_rate: Float32
     weight_mean: Float32
     weight_var: Float32
+    nodes: TileNodes = _NO_NODES  # of its kernels, those that came in whole steps
+    steps: Steps | None = None  # None: none did
 
 
-_ARRAYS = _Tile._fields[1:]
+_ARRAYS = _Tile._fields[1:7]
 
 
 @dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
@@ -164,7 +180,8 @@ _NO_TILE = _Tile(0, np.zeros((0, 3)), np.zeros((0, 3), np.float32), _NONE, _NONE
 class _Reply:
     """A reply in the making; refuses what does not fit."""
 
-    def __init__(self) -> None:
+    def __init__(self, state: _State | None) -> None:
+        self._state = state  # what it is a reply to
         self._check = PartCheck("tiles")
         self._parts: dict[int, tuple[TilesPart, list[tuple[TileIndex, _Tile]]]] = {}
         self._n_bytes = 0
@@ -173,14 +190,16 @@ class _Reply:
         same = {name: getattr(part, name) for name in _SAME_IN_ALL_PARTS}
         self._check.add(part.part, part.n_parts, **same)
         try:
-            self._parts[part.part] = (part, list(_tiles_of(part)))
+            held = {} if self._state is None or part.whole else self._state.tiles
+            self._parts[part.part] = (part, list(_tiles_of(part, held)))
         except WireError as error:
             raise BadReplyError(f"tiles: {error}") from error
         self._n_bytes += n_bytes
 
-    def applied_to(self, state: _State | None) -> tuple[_State, MirrorUpdate]:
+    def applied(self) -> tuple[_State, MirrorUpdate]:
         """What was before, with all that came in its place; and what came."""
         self._check.finish()
+        state = self._state
         first = self._parts[0][0]
         if first.whole != (state is None or state.epoch != first.epoch):
             raise BadReplyError(
@@ -220,17 +239,12 @@ class _Reply:
         for number in range(len(self._parts)):
             for place, (index, tile) in enumerate(self._parts[number][1]):
                 before = pieces.setdefault(index, [])
-                if before and (place > 0 or index != last or before[0].revision != tile.revision):
+                goes_on = place == 0 and index == last and tile.steps is None
+                if before and not (goes_on and before[0].revision == tile.revision):
                     raise BadReplyError(f"tiles: tile {index} came twice")
                 before.append(tile)
                 last = index
-        return {
-            index: _Tile(
-                found[0].revision,
-                *(np.concatenate([getattr(t, name) for t in found]) for name in _ARRAYS),
-            )
-            for index, found in pieces.items()
-        }
+        return {index: _joined(*tiles) for index, tiles in pieces.items()}
 
     def _gone(self, kept: Mapping[TileIndex, _Tile]) -> list[TileIndex]:
         gone: list[TileIndex] = []
@@ -247,7 +261,7 @@ class _Reply:
         return gone
 
 
-def _tiles_of(part: TilesPart) -> Iterator[tuple[TileIndex, _Tile]]:
+def _tiles_of(part: TilesPart, held: Mapping[TileIndex, _Tile]) -> Iterator[tuple[TileIndex, _Tile]]:
     """The tiles of one part, map frame, with arrays of their own.
 
     Raises:
@@ -256,19 +270,51 @@ def _tiles_of(part: TilesPart) -> Iterator[tuple[TileIndex, _Tile]]:
     tiles = _unpack(part.tiles, "tiles", (DType.INT64,), (4, None), 4 * MAX_PART_KERNELS)
     counts = _unpack(part.counts, "counts", (DType.INT64,), (tiles.shape[1],), MAX_PART_KERNELS)
     k = part.kernels.weight_mean.shape[0] if part.kernels.weight_mean.shape else 0
-    if (counts < 1).any() or (counts > k).any() or counts.sum() != k:
+    changes = None if part.changes is ABSENT else part.changes
+    least = 1 if changes is None else 0
+    if (counts < least).any() or (counts > k).any() or counts.sum() != k:
         raise BadReplyError(f"tiles: the counts of part {part.part} are not those of {k} kernels")
     kernels = _decode(part.kernels, k)
-    with np.errstate(over="ignore", invalid="ignore"):
-        hinge = kernels.hinge_mean + np.repeat(tiles[:3].T * part.tile_size_m, counts, axis=0)
-    kernels = kernels._replace(hinge_mean=hinge)
-    if not all(np.isfinite(getattr(kernels, name)).all() for name in _ARRAYS):
-        raise BadReplyError("tiles: kernels with numbers that are not finite")
-    ends = np.cumsum(counts)
-    for (x, y, z, revision), stop, count in zip(tiles.T.tolist(), ends, counts, strict=True):
-        run = slice(stop - count, stop)
-        # copies: a view would keep the whole part alive
-        yield (x, y, z), _Tile(revision, *(getattr(kernels, name)[run].copy() for name in _ARRAYS))
+    stops = np.cumsum(counts)
+    runs = [slice(stop - count, stop) for stop, count in zip(stops, counts, strict=True)]
+    # copies: a view would keep the whole part alive
+    found = [
+        _Tile(revision, *(getattr(kernels, name)[run].copy() for name in _ARRAYS))
+        for run, revision in zip(runs, tiles[3].tolist(), strict=True)
+    ]
+    indices: list[TileIndex] = [(x, y, z) for x, y, z in tiles[:3].T.tolist()]
+    if changes is not None:
+        found = _with_nodes(found, changes, [held.get(index) for index in indices])
+    for index, tile in zip(indices, found, strict=True):
+        with np.errstate(over="ignore", invalid="ignore"):
+            hinge = tile.hinge_mean + np.array(index, np.float64) * part.tile_size_m
+        placed = tile._replace(hinge_mean=hinge)
+        if not all(np.isfinite(getattr(placed, name)).all() for name in _ARRAYS):
+            raise BadReplyError("tiles: kernels with numbers that are not finite")
+        yield index, placed
+
+
+def _joined(first: _Tile, *others: _Tile | Kernels) -> _Tile:
+    """The first tile with the kernels of others too."""
+    arrays: dict[str, Any] = {
+        name: np.concatenate([getattr(s, name) for s in (first, *others)]) for name in _ARRAYS
+    }
+
+    return first._replace(**arrays)
+
+
+def _with_nodes(tiles: list[_Tile], changes: TileChanges, held: list[_Tile | None]) -> list[_Tile]:
+    """Tiles with the kernels that stand on lattices, hinges relative to the corners of their tiles."""
+    steps = steps_of(changes)
+
+    def before(t: int) -> TileNodes | None:
+        tile = held[t]
+        return tile.nodes if tile is not None and tile.steps == steps else None
+
+    out = []
+    for tile, nodes in zip(tiles, changed_nodes(changes, before, len(tiles)), strict=True):
+        out.append(_joined(tile, *kernels_of(nodes, steps))._replace(nodes=nodes, steps=steps))
+    return out
 
 
 def _decode(coded: CodedKernels, k: int) -> _Tile:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from typing import NamedTuple
 
+from potserver import allocator
 from potserver.adapters.clouds import CloudReader
 from potserver.adapters.intake import CloudJob, IntakeQueue
 from potserver.adapters.poses import WAIT_S, PoseNotYetError
@@ -25,6 +26,7 @@ from potserver.storage.read_only import ReadOnlyStore
 log = get_logger("potserver.writer")
 
 Keeper = MapStore | MemoryOnly | ReadOnlyStore
+_GIVE_BACK_SCANS = 25  # after so many, memory that is free goes back to the system
 
 
 class Bounds(NamedTuple):
@@ -53,6 +55,7 @@ class MapWriter:
         self._map_id, self._mapper, self._keeper, self._order = mapper.map_id, mapper, keeper, order
         self._bounds = bounds
         self._size = MapSize()
+        self._n_scans = 0  # since the start
         self._intake, self._reader, self._receipts, self._health = intake, reader, receipts, health
 
     def run(self) -> None:
@@ -178,7 +181,8 @@ class MapWriter:
             check_not_future(scan.stamp_ns, self._bounds.max_future_s)
             self._order.check(scan.robot_id, scan.session, scan.seq)
             started_s = time.perf_counter()
-            update = self._mapper.integrate(scan, commit=lambda: self._keeper.append(scan))
+            with self._keeper.keeping(scan) as commit:
+                update = self._mapper.integrate(scan, commit=commit)
         except PotserverError as error:
             if not (isinstance(error, PoseNotYetError) and self._waits(job, error)):
                 self._receipts.refuse(job, error)
@@ -193,6 +197,9 @@ class MapWriter:
         self._health.observe("integrate", integrate_ms)
         self._health.observe("clouds.wait", wait_ms)
         self._receipts.accept(job, scan, update, wait_ms=wait_ms, integrate_ms=integrate_ms)
+        self._n_scans += 1
+        if self._n_scans % _GIVE_BACK_SCANS == 0:
+            allocator.give_back()
         log.info(
             "scan_integrated",
             map_id=self._map_id,

@@ -11,16 +11,17 @@ from numpy.typing import ArrayLike, NDArray
 
 from potschemas.answers import AnswerRule
 from potserver.asking.plan import Plan, checked_box
+from potserver.asking.tile_codes import Steps, TileCodes, TileKey, TileMemory, code_tile
 from potserver.domain.map_state import MapState
 from potserver.domain.tiles import Tile, TileIndex
-from potserver.domain.types import Float32, KernelSet
+from potserver.domain.types import KernelSet
 from potserver.errors import BadPointsError, ShapeError, TooLargeError
 from potserver.limits import Limits
 from potserver.numerics.arrays import Int64
 
-MANTISSA_BITS = 23  # of a float32
-_LEAST_BITS = 2
+LEAST_STEP, MOST_STEP = 1e-4, 10.0  # log-odds
 PART_KERNELS = 20_000  # of a part: 200 kB on the wire, at most 800; askers take up to MAX_PART_KERNELS
+_SHORTER = 2  # so many times as many, where two bytes tell a kernel
 
 
 class KnownTiles(NamedTuple):
@@ -35,24 +36,32 @@ class KnownTiles(NamedTuple):
 class Tiles:
     """What is asked: the tiles that a box touches, where they differ from those that the asker has.
 
-    With `mantissa_bits` of b the latent mean changes by at most 2^-(b + 1) sum_m |weight_mean_m| phi_m, and the probability by
-    at most a quarter of that, beside a relative 2^-(b + 1) of the latent variance.
+    With a `step` the latent mean is off by at most step / 2 sum_m phi_m, and the probability by at most a quarter of that,
+    beside exp(1.5 step) - 1 of the latent variance.
     """
 
     known: KnownTiles | None = None  # what the asker has; None = nothing
     lower: ArrayLike | None = None  # (3,) m, map frame; None = no bound on that side
     upper: ArrayLike | None = None  # (3,) m, map frame; likewise
-    # of each weight's mean and variance, 2 to 23; fewer than 23 are rounded to
-    mantissa_bits: int = MANTISSA_BITS
+    step: float | None = (
+        None  # log-odds: weights are rounded to it and nodes told by what has changed; None = as they are
+    )
 
     def plan(
-        self, state: MapState, limits: Limits, *, tile_size_m: float, part_kernels: int = PART_KERNELS
+        self,
+        state: MapState,
+        limits: Limits,
+        memory: TileMemory,
+        *,
+        tile_size_m: float,
+        part_kernels: int = PART_KERNELS,
     ) -> TilesPlan:
         """Check the question, and compare. A tile without kernels says nothing and counts as none.
 
         Args:
             state: Of the map.
             limits: That the question has to keep.
+            memory: What was sent before, of the same map.
             tile_size_m: Edge of a tile where the map has none yet.
             part_kernels: Of a part, at most.
         Raises:
@@ -61,10 +70,8 @@ class Tiles:
         """
         lower, upper = checked_box(self.lower, self.upper, limits)
         self._check_known(limits)
-        if not _LEAST_BITS <= self.mantissa_bits <= MANTISSA_BITS:
-            raise BadPointsError(
-                f"mantissa_bits is {self.mantissa_bits}, need {_LEAST_BITS} to {MANTISSA_BITS}"
-            )
+        if self.step is not None and not LEAST_STEP <= self.step <= MOST_STEP:
+            raise BadPointsError(f"step is {self.step}, need {LEAST_STEP} to {MOST_STEP}")
         tiled = state.tiled
         size = tile_size_m if tiled is None else tiled.grid.size_m
         low = None if lower is None else np.floor(lower / size).astype(np.int64)
@@ -72,6 +79,15 @@ class Tiles:
         present = {} if tiled is None else _present(tiled.tiles, low, high)
         is_whole = self.known is None or self.known.epoch != state.epoch
         revisions = {} if self.known is None or is_whole else _revisions(self.known, low, high)
+        changed = tuple((i, tile) for i, tile in present.items() if revisions.get(i) != tile.revision)
+        coding = None
+        if self.step is not None:
+            steps = Steps.of(self.step, state.snapshot.rule.prior_var)
+            keys = [
+                TileKey(state.epoch, i, revisions[i], steps) if i in revisions else None for i, _ in changed
+            ]
+            bases = tuple(None if key is None else memory.get(key) for key in keys)
+            coding = Coding(steps, memory, bases)
         return TilesPlan(
             epoch=state.epoch,
             map_revision=state.map_revision,
@@ -79,10 +95,10 @@ class Tiles:
             tile_size_m=size,
             spacings_m=() if tiled is None else (tiled.grid.coarse_m, tiled.grid.fine_m),
             is_whole=is_whole,
-            tiles=tuple((i, tile) for i, tile in present.items() if revisions.get(i) != tile.revision),
+            tiles=changed,
             gone=np.array([i for i in revisions if i not in present], np.int64).reshape(-1, 3),
-            mantissa_bits=self.mantissa_bits,
-            part_size=part_kernels,
+            coding=coding,
+            part_size=part_kernels if coding is None else _SHORTER * part_kernels,
         )
 
     def _check_known(self, limits: Limits) -> None:
@@ -97,13 +113,29 @@ class Tiles:
             raise TooLargeError(f"{n} known tiles, the limit is {limits.max_query_tiles}; ask about a box")
 
 
+class Change(NamedTuple):
+    """A tile, and what of it the asker has."""
+
+    codes: TileCodes
+    base: TileCodes | None  # None = nothing
+
+
+class Coding(NamedTuple):
+    """How a plan tells tiles by what has changed."""
+
+    steps: Steps
+    memory: TileMemory
+    bases: tuple[TileCodes | None, ...]  # of each tile of the plan
+
+
 class TileRun(NamedTuple):
     """Some tiles, or parts of them, one after the other."""
 
     indices: Int64  # (T, 3)
     revisions: Int64  # (T,)
-    counts: Int64  # (T,) kernels of each, at least 1
-    kernels: KernelSet  # relative to the lower corners of their tiles
+    counts: Int64  # (T,) of `kernels` in each
+    kernels: KernelSet  # relative to the lower corners of their tiles; without those in `changes`
+    changes: tuple[Change, ...] = ()  # of each tile, where the plan has a coding: tiles are whole then
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -118,7 +150,7 @@ class TilesPlan(Plan[TileRun]):
     is_whole: bool  # all tiles of the box, because what the asker has is of another epoch
     tiles: tuple[tuple[TileIndex, Tile], ...]  # that differ, each with kernels
     gone: Int64  # (G, 3) tiles that the asker has and the map has not
-    mantissa_bits: int
+    coding: Coding | None
     part_size: int
 
     @property
@@ -127,42 +159,40 @@ class TilesPlan(Plan[TileRun]):
         return sum(len(tile.kernels) for _, tile in self.tiles)
 
     def part(self, i: int) -> TileRun:
-        """One run of kernels; a tile may go on in the next."""
+        """One run of kernels. Without a coding a tile may go on in the next; with one it is where its first kernel is."""
         sizes = np.array([len(tile.kernels) for _, tile in self.tiles], np.int64)
-        ends = np.cumsum(sizes)
+        starts = np.cumsum(sizes) - sizes
         run = self.items(i)
-        start = np.maximum(run.start - (ends - sizes), 0)
-        counts = np.minimum(run.stop - (ends - sizes), sizes) - start
+        if self.coding is not None:
+            return self._coded(np.flatnonzero((starts >= run.start) & (starts < run.stop)), self.coding)
+        start = np.maximum(run.start - starts, 0)
+        counts = np.minimum(run.stop - starts, sizes) - start
         members = np.flatnonzero(counts > 0)
-        kernels = KernelSet.concatenate(
-            [
-                self.tiles[t][1].kernels.kernels.take(slice(int(start[t]), int(start[t] + counts[t])))
-                for t in members
-            ]
-        )
-        if self.mantissa_bits < MANTISSA_BITS:
-            kernels = kernels.replace(
-                weight_mean=rounded(kernels.weight_mean, self.mantissa_bits),
-                weight_var=rounded(kernels.weight_var, self.mantissa_bits),
-            )
+        kernels = [
+            self.tiles[t][1].kernels.kernels.take(slice(int(start[t]), int(start[t] + counts[t])))
+            for t in members
+        ]
+        return self._run(members, kernels)
+
+    def _coded(self, members: NDArray[np.intp], coding: Coding) -> TileRun:
+        changes = []
+        for t in members:
+            index, tile = self.tiles[t]
+            key = TileKey(self.epoch, index, tile.revision, coding.steps)
+            codes = coding.memory.get(key)
+            if codes is None:
+                codes = code_tile(tile.kernels.kernels, self.spacings_m, self.tile_size_m, coding.steps)
+                coding.memory.put(key, codes)
+            changes.append(Change(codes, coding.bases[t]))
+        return self._run(members, [c.codes.others for c in changes])._replace(changes=tuple(changes))
+
+    def _run(self, members: NDArray[np.intp], kernels: list[KernelSet]) -> TileRun:
         return TileRun(
             np.array([self.tiles[t][0] for t in members], np.int64).reshape(-1, 3),
             np.array([self.tiles[t][1].revision for t in members], np.int64),
-            counts[members],
-            kernels,
+            np.array([len(k) for k in kernels], np.int64),
+            KernelSet.concatenate(kernels),
         )
-
-
-def rounded(values: Float32, bits: int) -> Float32:
-    """Float32 numbers with mantissas of 2 to 22 bits, the nearest ones: off by at most 2^-(bits + 1) of themselves.
-
-    Nothing becomes infinite: what would is cut off instead. Below 2^-126 numbers are off by at most 2^-(bits + 127).
-    """
-    dropped = MANTISSA_BITS - bits
-    keep = np.uint32((0xFFFFFFFF << dropped) & 0xFFFFFFFF)
-    raw = values.view(np.uint32)
-    up = ((raw + np.uint32(1 << (dropped - 1))) & keep).view(np.float32)
-    return np.where(np.isfinite(up), up, (raw & keep).view(np.float32))
 
 
 def _present(tiles: Mapping[TileIndex, Tile], low: Int64 | None, high: Int64 | None) -> dict[TileIndex, Tile]:

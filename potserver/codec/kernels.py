@@ -11,13 +11,12 @@ from numpy.typing import NDArray
 from potschemas import messages
 from potschemas.answers import AnswerRule
 from potschemas.wire import pack_array
+from potserver.asking.lattices import LEAST_ON_LATTICE, distinct_rows, lattice_of, shapes_of
 from potserver.codec.base import float32_fields
-from potserver.domain.types import Float32, Float64, KernelSet
+from potserver.domain.types import KernelSet
 
 _BYTES_OF_SHAPE = 5 * 4  # hinge_var, gamma_shape, gamma_rate
 _BYTES_OF_LATTICE = 4 * 8
-_CELL_LIMIT = 2.0**31  # far beyond a tile; every float64 below is exact
-_LEAST_ON_LATTICE = 4  # kernels: of fewer, the hinges themselves are shorter than a lattice
 
 
 def encode_kernels(kernels: KernelSet, rule: AnswerRule) -> messages.Kernels:
@@ -38,16 +37,16 @@ def code_kernels(kernels: KernelSet, spacings_m: Sequence[float]) -> messages.Co
         spacings_m: Lattices to try.
     """
     hinge = kernels.hinge_mean.astype(np.float32)
-    shapes = np.column_stack([kernels.hinge_var, kernels.gamma_shape, kernels.gamma_rate])
+    shapes = shapes_of(kernels)
     lattices = np.zeros((len(hinge), 4))
     cells = np.zeros((len(hinge), 3), np.int64)
-    first, kind = _distinct_rows(shapes)
+    first, kind = distinct_rows(shapes)
     is_coded = len(first) * (_BYTES_OF_SHAPE + _BYTES_OF_LATTICE) + len(hinge) < len(hinge) * _BYTES_OF_SHAPE
     if is_coded:
         shapes, lattices = shapes[first], lattices[first]
-        for number in np.flatnonzero(np.bincount(kind) >= _LEAST_ON_LATTICE):
+        for number in np.flatnonzero(np.bincount(kind) >= LEAST_ON_LATTICE):
             members = np.flatnonzero(kind == number)
-            found = _lattice_of(hinge[members], spacings_m)
+            found = lattice_of(hinge[members], spacings_m)
             if found is not None:
                 lattices[number], cells[members] = found
     on_lattice = lattices[kind, 0] > 0
@@ -60,45 +59,6 @@ def code_kernels(kernels: KernelSet, spacings_m: Sequence[float]) -> messages.Co
         weight_mean=pack_array(kernels.weight_mean),
         weight_var=pack_array(kernels.weight_var),
     )
-
-
-def _distinct_rows(rows: Float32) -> tuple[NDArray[np.intp], NDArray[np.int64]]:
-    """Where each distinct row stands first, and for each row, which of the distinct ones it is; compared bit by bit."""
-    number = np.zeros(len(rows), np.int64)
-    first = np.zeros(min(len(rows), 1), np.intp)
-    for column in _bits(rows.T):
-        values, place = np.unique(column, return_inverse=True)
-        if len(values) > 1:
-            _, first, number = np.unique(number * len(values) + place, return_index=True, return_inverse=True)
-    return first, number
-
-
-def _lattice_of(hinge: Float32, spacings_m: Sequence[float]) -> tuple[Float64, NDArray[np.int64]] | None:
-    """Spacing and offsets, (4,) m, of a lattice that gives exactly these (K, 3) hinges, and their cells; None without one."""
-    for spacing in spacings_m:
-        axes = [found for axis in hinge.T if (found := _cells_along(axis, spacing)) is not None]
-        if len(axes) == 3:
-            offsets, cells = zip(*axes, strict=True)
-            return np.array([spacing, *offsets]), np.stack(cells, axis=1)
-    return None
-
-
-def _cells_along(axis: Float32, spacing: float) -> tuple[float, NDArray[np.int64]] | None:
-    """Offset and cells that give exactly these (K,) coordinates: centres of cells, or the one height of a planar map."""
-    wide = axis.astype(np.float64)
-    for offset in (0.5 * spacing, float(wide[0])):
-        cells = np.rint((wide - offset) / spacing)
-        if (
-            np.abs(cells).max() < _CELL_LIMIT
-            and (_bits((offset + cells * spacing).astype(np.float32)) == _bits(axis)).all()
-        ):
-            return offset, cells.astype(np.int64)
-    return None
-
-
-def _bits(values: Float32) -> NDArray[np.uint32]:
-    """What tells -0 from 0, and is the same only where nothing was lost."""
-    return np.ascontiguousarray(values).view(np.uint32)
 
 
 def _small(numbers: NDArray[np.int64]) -> NDArray[np.uint8] | NDArray[np.int64]:

@@ -68,6 +68,9 @@ def add(commands: Any) -> None:
 
 
 def _run(options: argparse.Namespace) -> int:
+    from potserver.allocator import use_one_heap
+
+    use_one_heap()
     import zenoh
 
     from potserver.log import configure_logging, get_logger

@@ -1,6 +1,7 @@
 """The journal of a map: every accepted scan, from before it is in the map until a snapshot has it.
 
-scans    a row a scan: its number, and the bytes of `pot.cloud.v1` with pose and robot, sealed
+scans    a row a scan: its number, and the bytes of `pot.cloud.v1` with pose and robot, sealed. One beyond the last of the head
+         is staged: it was written while it was worked on, and does not count
 head     one row: which scans there must be (`_Head`), sealed
 """
 
@@ -82,6 +83,7 @@ class Journal:
             StorageError: the disk refuses.
         """
         with transaction(self._connection, self._path):
+            self._drop_staged()
             if number > self.last:
                 self._prune(number)
                 head = self._put_head(last=number, pruned=number, closed=False)
@@ -105,24 +107,36 @@ class Journal:
         """Scans up to this number may be gone."""
         return self._head.pruned
 
-    def append(self, cloud: bytes, *, prune_to: int, check: Callable[[], None] = lambda: None) -> None:
-        """Keep one more scan; it is on the disk when this returns.
+    def stage(self, cloud: bytes, *, prune_to: int, check: Callable[[], None] = lambda: None) -> None:
+        """Write a scan, on the disk when this returns, that does not count before `count_staged`. One that never did goes.
 
         Args:
             cloud: The scan as `pot.cloud.v1`, with pose and robot.
             prune_to: Number of the last scan that is in a snapshot: it and those before it are deleted.
             check: Called before anything is written; if it raises, nothing is.
         Raises:
-            StorageError: the disk refuses; the journal is as it was.
+            StorageError: the disk refuses.
         """
         number = self._head.last + 1
+        content = sealed(cloud, place=_place(number))
         with transaction(self._connection, self._path):
             check()
-            self._connection.execute(
-                "INSERT INTO scans VALUES (?, ?)", (number, sealed(cloud, place=_place(number)))
-            )
+            self._connection.execute("INSERT OR REPLACE INTO scans VALUES (?, ?)", (number, content))
             self._prune(prune_to)
-            head = self._put_head(last=number, pruned=max(prune_to, self.pruned))
+            head = self._put_head(pruned=max(prune_to, self.pruned))
+        self._head = head
+
+    def count_staged(self, check: Callable[[], None] = lambda: None) -> None:
+        """The staged scan is one of the journal from now on, and that is on the disk when this returns.
+
+        Args:
+            check: As for `stage`.
+        Raises:
+            StorageError: the disk refuses; the journal is as it was.
+        """
+        with transaction(self._connection, self._path):
+            check()
+            head = self._put_head(last=self._head.last + 1)
         self._head = head
 
     def scans(self, after: int) -> Iterator[tuple[int, bytes]]:
@@ -154,6 +168,7 @@ class Journal:
         try:
             if complete_to is not None and complete_to == self.last:
                 with transaction(self._connection, self._path):
+                    self._drop_staged()
                     self._prune(complete_to)
                     self._put_head(pruned=complete_to, closed=True)
         finally:
@@ -170,6 +185,10 @@ class Journal:
 
     def _prune(self, number: int) -> None:
         self._connection.execute("DELETE FROM scans WHERE number <= ?", (number,))
+
+    def _drop_staged(self) -> None:
+        """A scan that never counted: whoever sent it was told so, or nothing."""
+        self._connection.execute("DELETE FROM scans WHERE number > ?", (self.last,))
 
     def _put_head(self, **changes: int | bool) -> _Head:
         head = msgspec.structs.replace(self._head, **changes)
@@ -213,7 +232,12 @@ def scans_after(path: Path, number: int) -> int | None:
     """
     try:
         with contextlib.closing(connect_read_only(path, KIND, busy_s=0.0)) as connection, reading(path):
-            row = connection.execute("SELECT COUNT(*) FROM scans WHERE number > ?", (number,)).fetchone()
+            found = connection.execute("SELECT content FROM head").fetchone()
+            content = None if found is None else unsealed(found[0])
+            last = 0 if content is None else msgspec.json.decode(content, type=_Head).last
+            row = connection.execute(
+                "SELECT COUNT(*) FROM scans WHERE number > ? AND number <= ?", (number, last)
+            ).fetchone()
     except StorageError as error:
         if error.reason == "in_use":
             return None

@@ -14,7 +14,7 @@ import time
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from types import TracebackType
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
@@ -29,6 +29,7 @@ from potserver.domain.running_scores import RunningScores
 from potserver.domain.tiles import Tile, TiledMap, TileGrid, TileIndex
 from potserver.domain.types import KernelSet
 from potserver.errors import MapFileError
+from potserver.numerics.threads import default_threads, parallel_map
 from potserver.storage.files import disk_faults, make_private_folder
 from potserver.storage.seal import SEAL_BYTES, seal_number, sealed, unsealed
 from potserver.storage.sqlite import (
@@ -52,6 +53,7 @@ KIND = Kind(
     ),
     readable=(1,),
 )
+_AT_ONCE = 256  # tiles that are read before they are decoded: some ten megabytes
 _SUM_LIMIT = 1 << 8 * SEAL_BYTES
 
 
@@ -308,7 +310,7 @@ def _read(
 ) -> SavedMap | None:
     """Read everything in one transaction, so that a writer beside us does not matter; `written` is filled."""
     tiles: dict[TileIndex, Tile] = {}
-    n_bytes = 0
+    n_bytes, threads = 0, default_threads()
     with reading(path), contextlib.ExitStack() as stack:
         connection.execute("BEGIN")
         stack.callback(connection.execute, "COMMIT")
@@ -320,7 +322,10 @@ def _read(
         record = _parse(path, found[0][0])
         version = int(connection.execute("PRAGMA user_version").fetchone()[0])
         grid = TileGrid(*record.grid) if record.grid is not None else None
-        for *named, data in connection.execute("SELECT x, y, z, data FROM tiles ORDER BY rowid"):
+        rows = connection.execute("SELECT x, y, z, data FROM tiles ORDER BY rowid")
+
+        def decoded(row: tuple[Any, ...]) -> tuple[TileIndex, Tile]:
+            *named, data = row
             if grid is None or not isinstance(data, bytes):
                 raise _damaged(path, "it has tiles and no grid, or a tile without bytes")
             try:
@@ -329,14 +334,18 @@ def _read(
                 raise _damaged(path, str(error)) from error
             if list(index) != named:
                 raise _damaged(path, f"tile {index} stands at {tuple(named)}")
-            tiles[index] = tile
-            n_bytes += len(data)
-            written[index] = (tile.revision, seal_number(data))
+            return index, tile
+
+        while some := rows.fetchmany(_AT_ONCE):
+            for row, (index, tile) in zip(some, parallel_map(decoded, some, threads, "files"), strict=True):
+                tiles[index] = tile
+                n_bytes += len(row[-1])
+                written[index] = (tile.revision, seal_number(row[-1]))
     if len(tiles) != record.n_tiles or f"{_sum(d for _, d in written.values()):x}" != record.tiles_digest:
         raise _damaged(path, f"it has {len(tiles)} tiles, and not the {record.n_tiles} that were written")
     if grid is None:
         return SavedMap(record, None, 0, version)
-    tiled = TiledMap.empty(grid)._replace(robots=tuple(record.robots)).with_tiles(tiles)
+    tiled = TiledMap.empty(grid)._replace(robots=tuple(record.robots)).with_tiles(tiles, threads=threads)
     return SavedMap(record, tiled, n_bytes, version)
 
 

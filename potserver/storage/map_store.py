@@ -1,17 +1,21 @@
 """Where a map survives: a journal of accepted scans, and snapshots of the tiles that they made.
 
-A scan is in the journal, on the disk, before it is in the map and before anybody is told so. A thread of its own writes
-snapshots, from states that never change. What a snapshot has, the journal forgets with its next scan. At the start the last
-snapshot is read, and the journal's scans after it are integrated again. There are two files so that a long snapshot never holds
-up a scan. Each knows what the other must have, and a mark beside them how far both have come: a file that is lost, old or
-cut off is noticed (`agreement`). Nothing is acknowledged that went into files which no longer bear their names.
+A scan is in the journal, on the disk, before it is in the map and before anybody is told so; most of that is done beside the
+work on the scan. A thread of its own writes snapshots, from states that never change. What a snapshot has, the journal
+forgets with its next scan. At the start the last snapshot is read, and the journal's scans after it are integrated again.
+There are two files so that a long snapshot never holds up a scan. Each knows what the other must have, and a mark beside them
+how far both have come: a file that is lost, old or cut off is noticed (`agreement`). Nothing is acknowledged that went into
+files which no longer bear their names.
 """
 
 from __future__ import annotations
 
+import concurrent.futures
+import contextlib
 import secrets
 import threading
 import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -49,8 +53,10 @@ from potserver.threads import spawn
 
 log = get_logger("potserver.store")
 
+Commit = Callable[[], None]  # the scan counts from when it returns
+
 SAVED = "saved"
-SNAPSHOT_SCANS = 50  # a restart integrates at most so many again: seconds
+SNAPSHOT_SCANS = 16  # a restart after a crash integrates at most so many again: seconds
 SNAPSHOT_BYTES = 64 * 2**20  # large scans make a snapshot due earlier
 MAX_SAVED = 100  # copies with a name: whoever reaches the server may ask for one more
 _REPORT_S = 2.0  # between two lines of progress
@@ -132,6 +138,7 @@ class MapStore:
         self._writing = threading.Lock()  # one snapshot at a time
         self._wanted = self._closed = False
         self._thread = spawn(f"{map_id}-snapshots", self._run)
+        self._stager = concurrent.futures.ThreadPoolExecutor(1, thread_name_prefix=f"{map_id}-journal")
 
     # --- start ----------------------------------------------------------------------------------------------
 
@@ -216,23 +223,37 @@ class MapStore:
 
     # --- scans ----------------------------------------------------------------------------------------------
 
-    def append(self, scan: Scan) -> None:
-        """Keep a scan that is about to enter the map; it is on the disk when this returns.
+    @contextlib.contextmanager
+    def keeping(self, scan: Scan) -> Iterator[Commit]:
+        """Write a scan beside the work of the block.
 
-        Raises:
+        Yields:
+            To be called when the scan is about to enter the map; it is on the disk when that returns.
+
+        Raises (what is called):
             StorageError: the disk refuses; the scan must not enter the map.
         """
-        started_s = time.perf_counter()
         payload = encode_cloud(scan)
+        staged = self._stager.submit(
+            self._journal.stage, payload, prune_to=self._taken, check=self._check_files
+        )
         try:
-            self._journal.append(payload, prune_to=self._taken, check=self._check_files)
+            yield lambda: self._keep(len(payload), staged)
+        finally:
+            concurrent.futures.wait([staged])  # nothing goes on behind the writer's back
+
+    def _keep(self, n_bytes: int, staged: concurrent.futures.Future[None]) -> None:
+        started_s = time.perf_counter()
+        try:
+            staged.result()
+            self._journal.count_staged(self._check_files)
             self._check_files()
         except StorageError:
             self._health.count("store.appends_failed")
             raise
         self._number = self._journal.last
         self._advance_mark(last=self._number)
-        self._unsaved_bytes += len(payload)
+        self._unsaved_bytes += n_bytes
         self._health.count("store.appends")
         self._health.observe("journal", (time.perf_counter() - started_s) * 1e3)
 
@@ -363,6 +384,7 @@ class MapStore:
             self._closed = True
             self._changed.notify_all()
         self._thread.join()
+        self._stager.shutdown()
 
     def _run(self) -> None:
         """Write the snapshots that `advance` asks for."""
@@ -437,8 +459,10 @@ class MemoryOnly:
     def check_takes(self) -> None:
         """All scans are welcome."""
 
-    def append(self, scan: Scan) -> None:
+    @contextlib.contextmanager
+    def keeping(self, scan: Scan) -> Iterator[Commit]:
         """Nothing to do."""
+        yield lambda: None
 
     def advance(self, mapper: MappingService, heard: Heard) -> None:
         """Nothing to do."""

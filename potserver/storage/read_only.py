@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import shutil
 import tempfile
 from pathlib import Path
@@ -15,7 +16,7 @@ from potserver.mapping.service import MappingService
 from potserver.storage.agreement import JOURNAL, MARK, TILES
 from potserver.storage.files import disk_faults
 from potserver.storage.journal import is_in_use
-from potserver.storage.map_store import MapStore, Restored
+from potserver.storage.map_store import Commit, MapStore, Restored
 from potserver.storage.sqlite import in_use, log_of
 
 _WHY = "this server answers from its maps and changes none: it was started with --read-only"
@@ -75,7 +76,7 @@ class ReadOnlyStore:
         """Raises ReadOnlyError: nothing is taken in."""
         raise ReadOnlyError(_WHY)
 
-    def append(self, scan: Scan) -> None:
+    def keeping(self, scan: Scan) -> contextlib.AbstractContextManager[Commit]:
         """Raises ReadOnlyError, as all that follows does."""
         raise ReadOnlyError(_WHY)
 

@@ -137,5 +137,5 @@ def _numbers(plain: bytes, start: int, column: _Column, n: int) -> tuple[NDArray
     width = max(1, column.width)
     n_bytes = n * width * dtype.itemsize
     planes = np.frombuffer(plain, np.uint8, n_bytes, start).reshape(width * dtype.itemsize, n)
-    array = np.ascontiguousarray(planes.T).view(dtype)
+    array = planes.T.copy().view(dtype)  # never a view: it would keep all of the tile's bytes
     return array.reshape((n, column.width) if column.width else n), start + n_bytes

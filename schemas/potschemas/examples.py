@@ -278,13 +278,41 @@ def examples() -> dict[str, m.Message]:
             upper=[8.0, 8.0, 4.0],
             epoch=2**62 + 1,
             known=_packed(np.array([[0, -1], [-1, -1], [0, 0], [30, 7]], np.int64)),
-            mantissa_bits=10,
             deadline_ms=1000.0,
         )
     )
+    add(m.TilesQuery(step=0.0625), "in_steps")
     add(m.TilesQuery(), "whole_map")
     add(_tiles_part())
     add(_tiles_part(deflated=True), "deflated")
+    add(
+        msgspec.structs.replace(
+            _tiles_part(),
+            n_parts=1,
+            counts=_packed(np.array([0, 3], np.int64)),
+            changes=m.TileChanges(
+                step=0.0625,
+                var_step=0.1875,
+                var_unit=100.0,
+                based=_packed(np.array([True, False])),
+                lattices=[
+                    m.LatticeNodes(
+                        shape=_packed(np.array([0.0625, 0.0625, 0.0625, 8.0, 4.0], np.float32)),
+                        spacing=0.5,
+                        offset=[0.25, 0.25, 0.25],
+                        cells=[16, 16, 16],
+                        tiles=_packed(np.array([0, 1], np.int64)),
+                        toggled=_packed(np.array([18, 1, 4096], np.int64)),  # nodes 17, 18 and 4114
+                        mean_changes=_packed(np.array([4, 1, 0], np.int64)),  # 2, -1, 0
+                        var_changes=_packed(np.array([0, 3, 0], np.int64)),  # 0, -2, 0
+                        new_means=_packed(np.array([96, 63], np.int64)),  # 48, -32
+                        new_vars=_packed(np.array([37, 0], np.int64)),  # -19, 0
+                    )
+                ],
+            ),
+        ),
+        "in_steps",
+    )
     add(
         msgspec.structs.replace(
             _tiles_part(),

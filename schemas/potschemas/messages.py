@@ -41,7 +41,8 @@ Probability = Annotated[float, msgspec.Meta(ge=0, le=1)]
 _Quantile = Annotated[float, msgspec.Meta(gt=0, lt=1)]
 Quantiles = Annotated[list[_Quantile], msgspec.Meta(max_length=16)]
 TileIndex = Annotated[list[_Int64], msgspec.Meta(min_length=3, max_length=3)]
-MantissaBits = Annotated[int, msgspec.Meta(ge=2, le=23)]
+WeightStep = Annotated[float, msgspec.Meta(ge=1e-4, le=10)]
+LatticeCells = Annotated[list[PositiveCount], msgspec.Meta(min_length=3, max_length=3)]
 
 # The type and the default of a field that a released schema got later: it is left out of the bytes, so that messages without
 # it stay as they were.
@@ -373,8 +374,8 @@ class TilesQuery(Message, frozen=True, kw_only=True):
     upper: Vector3 | None = None  # m, map frame; an absent corner is no bound on its side
     epoch: Count | None = None  # that `known` is of, from an earlier reply; absent = nothing is known
     known: Packed | None = None  # (4, N) int64: index x, y, z and revision of each tile that the asker has
-    mantissa_bits: MantissaBits | None = None  # of each weight to send, rounded; absent = 23, which is all
     deadline_ms: Positive | None = None  # ms from arrival; past it no work and no part begins
+    step: WeightStep | Absent = ABSENT  # log-odds, of weights: tiles come as `changes`; absent = exact
 
 
 class CodedKernels(msgspec.Struct, frozen=True, kw_only=True):
@@ -392,8 +393,38 @@ class CodedKernels(msgspec.Struct, frozen=True, kw_only=True):
     weight_var: Packed  # (K,) float32, log-odds^2
 
 
+class LatticeNodes(msgspec.Struct, frozen=True, kw_only=True):
+    """Nodes of one lattice in T of a part's tiles, relative to what the asker has of it there.
+
+    Node (x, y, z) of the t-th of them has the number t * X Y Z + (x * Y + y) * Z + z, with X, Y, Z of `cells`. Its hinge from
+    the tile's corner is offset + (x, y, z) * spacing, computed in float64 and rounded to float32. Signed numbers n travel as
+    2 n where n >= 0, and else as -2 n - 1.
+    """
+
+    shape: Packed  # (5,) float32 that all nodes share: hinge_var along x, y, z, m^2; gamma_shape; gamma_rate, m^2
+    spacing: Positive  # m
+    offset: Vector3  # m
+    cells: LatticeCells  # nodes along x, y, z
+    tiles: Packed  # (T,) int64, columns of the part's `tiles`, ascending
+    toggled: Packed  # (M,) int64: numbers of nodes that come or go, ascending, as differences from -1 on
+    mean_changes: Packed  # (S,) int64, signed: change in steps of the means of nodes that stay, by number
+    var_changes: Packed  # (S,) int64, signed: likewise of the variances
+    new_means: Packed  # (N,) int64, signed: means in steps of the nodes that come, by number
+    new_vars: Packed  # (N,) int64, signed: variances, in steps from `var_unit`
+
+
+class TileChanges(msgspec.Struct, frozen=True, kw_only=True):
+    """Nodes of the part's tiles in whole steps: mean = n * step, var = var_unit * exp(n * var_step)."""
+
+    step: Positive  # log-odds
+    var_step: Positive  # of the logarithm
+    var_unit: Positive  # log-odds^2
+    based: Packed  # (T,) bool, of each tile: relative to what the asker has; false = to nothing
+    lattices: list[LatticeNodes]  # of a tile in none of them no nodes are left
+
+
 class TilesPart(Message, frozen=True, kw_only=True):
-    """One part of a `q/tiles` reply: a run of kernels, tile after tile. A tile may go on in the next part."""
+    """One part of a `q/tiles` reply: a run of kernels, tile after tile. Without `changes` a tile may go on in the next part."""
 
     schema: ClassVar[str] = "pot.tiles_part.v1"
 
@@ -404,13 +435,14 @@ class TilesPart(Message, frozen=True, kw_only=True):
     whole: bool  # the epoch is not the asker's: these are all tiles of the box, what it had is void
     tile_size_m: Positive  # m, edge of a tile; its lower corner is index * tile_size_m
     tiles: Packed  # (4, T) int64: index x, y, z and revision of each tile that differs
-    counts: Packed  # (T,) int64, kernels of each tile in this part, at least 1
+    counts: Packed  # (T,) int64, how many of `kernels` are of each tile; at least 1 without `changes`
     gone: Packed | None = None  # (3, G) int64, indices of tiles known to the asker and not there; in part 0
-    kernels: CodedKernels  # of the tiles one after the other
+    kernels: CodedKernels  # of the tiles one after the other, but for those in `changes`
     observed_activation: Finite  # summed activation of known weights, below which a point is unobserved
     prior_var: Finite  # log-odds^2, of the latent where nothing was observed
     residual_var: Finite  # log-odds^2, added in the measure that this sum falls short of 1
     mean_moderation: Finite  # share of the latent variance that pulls the mean towards 0.5
+    changes: TileChanges | Absent = ABSENT  # where the query has a step
 
 
 class AtomInfo(msgspec.Struct, frozen=True, kw_only=True):

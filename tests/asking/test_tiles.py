@@ -8,12 +8,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from potserver.asking.tiles import KnownTiles, Tiles, TilesPlan, rounded
+from potserver.asking.tile_codes import TileMemory
+from potserver.asking.tiles import KnownTiles, Tiles, TilesPlan
 from potserver.domain.map_state import MapState
 from potserver.domain.types import KernelSet
 from potserver.errors import BadPointsError, OutOfRangeError, ShapeError, TooLargeError
 from potserver.limits import Limits
-from tests.tiled_maps import GRID, free_kernels, lattice_kernels, tiled_state
+from tests.tiled_maps import GRID, free_kernels, tiled_state
 
 TILES = {
     (0, 0, 0): (free_kernels(30), 3),
@@ -33,7 +34,9 @@ def plan_of(
     known: KnownTiles | None = None, *, state: MapState = STATE, part_kernels: int = 20_000, **asked: Any
 ) -> TilesPlan:
     limits = FewTiles(max_coordinate_m=1e4)
-    return Tiles(known, **asked).plan(state, limits, tile_size_m=GRID.size_m, part_kernels=part_kernels)
+    return Tiles(known, **asked).plan(
+        state, limits, TileMemory(), tile_size_m=GRID.size_m, part_kernels=part_kernels
+    )
 
 
 def known(*tiles: tuple[int, int, int, int], epoch: int = 9) -> KnownTiles:
@@ -124,44 +127,11 @@ def test_parts_hold_no_more_than_asked_for_and_together_all(part_kernels: int) -
         ({"lower": [np.nan, 0, 0]}, BadPointsError),
         ({"upper": [1e5, 0, 0]}, OutOfRangeError),
         ({"lower": [0, 0]}, ShapeError),
-        ({"mantissa_bits": 1}, BadPointsError),
-        ({"mantissa_bits": 24}, BadPointsError),
+        ({"step": 0.0}, BadPointsError),
+        ({"step": 11.0}, BadPointsError),
+        ({"step": float("nan")}, BadPointsError),
     ],
 )
 def test_bad_questions(arguments: dict, error: type[Exception]) -> None:
     with pytest.raises(error):
         plan_of(**arguments)
-
-
-@pytest.mark.parametrize("bits", [2, 7, 10, 22])
-def test_rounded_numbers_are_the_nearest_of_so_many_bits(bits: int) -> None:
-    rng = np.random.default_rng(bits)
-    values = (rng.normal(size=5000) * 10.0 ** rng.uniform(-30, 30, 5000)).astype(np.float32)
-    short = rounded(values, bits)
-    assert np.abs(short.astype(np.float64) / values - 1.0).max() <= 2.0 ** -(bits + 1)
-    _, exponent = np.frexp(values)
-    steps = np.ldexp(short.astype(np.float64), bits + 1 - exponent)
-    np.testing.assert_array_equal(steps, np.rint(steps))
-    np.testing.assert_array_equal(rounded(short, bits), short)
-
-
-def test_rounding_keeps_zero_and_makes_nothing_infinite() -> None:
-    ends = np.array([0.0, -0.0, 3.4028235e38, -3.4028235e38, 1e-45], np.float32)
-    short = rounded(ends, 2)
-    assert np.isfinite(short).all()
-    np.testing.assert_array_equal(np.signbit(short), np.signbit(ends))
-    np.testing.assert_array_equal(short[:2], ends[:2])
-    assert short[2] == -short[3] > 2.9e38
-
-
-def test_fewer_bits_change_answers_by_no_more_than_was_promised() -> None:
-    kernels, bits = lattice_kernels(2000), 6
-    state = tiled_state({(0, 0, 0): (kernels, 1)})
-    short = plan_of(state=state, mantissa_bits=bits).part(0).kernels
-    points = np.random.default_rng(0).uniform(1, 7, (200, 3))
-    squared = ((points[:, None] - kernels.hinge_mean) ** 2).sum(axis=2)
-    phi = np.exp(-kernels.gamma.astype(np.float64) * squared)
-    change = np.abs(phi @ (short.weight_mean - kernels.weight_mean.astype(np.float64)))
-    bound = 2.0 ** -(bits + 1) * (phi @ np.abs(kernels.weight_mean))
-    assert (change <= bound).all()
-    assert change.max() > 0.01 * bound.max(), "it did round"

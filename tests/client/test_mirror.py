@@ -14,6 +14,7 @@ from potclient.errors import BadReplyError, IncompleteReplyError, UsageError
 from potclient.mirror import MapMirror
 from potschemas.messages import MAX_PART_KERNELS, DType, Packed, TilesPart, TilesQuery
 from potschemas.wire import pack_array
+from potserver.asking.tile_codes import TileMemory
 from potserver.domain.map_state import MapState
 from potserver.domain.types import KernelSet
 from tests.tiled_maps import asking, free_kernels, lattice_kernels, parts_about, tiled_state
@@ -125,23 +126,54 @@ def test_parts_may_come_in_any_order(map_: Map) -> None:
     map_.assert_mirrored(mirror)
 
 
-def test_a_box_and_the_bits_are_asked_for(map_: Map) -> None:
-    mirror = map_.make_mirror([8.5, 0.5, 0.5], [9.0, 1.0, 1.0], mantissa_bits=5)
+def test_a_box_and_the_step_are_asked_for(map_: Map) -> None:
+    mirror = map_.make_mirror([8.5, 0.5, 0.5], [9.0, 1.0, 1.0], step=0.25)
     assert mirror.update().n_tiles == 1
     mirror.update()
     first, second = map_.queries
-    assert (first.lower, first.upper, first.mantissa_bits, first.known) == (
+    assert (first.lower, first.upper, first.step, first.known) == (
         [8.5, 0.5, 0.5],
         [9.0, 1.0, 1.0],
-        5,
+        0.25,
         None,
     )
     assert second.epoch == map_.epoch
     assert second.known is not None
     assert second.known.shape == [4, 1]
-    exact = TILES[(1, 0, 0)][0].weight_mean
-    ratio = mirror.kernels.weight_mean / exact
-    assert 0 < np.abs(ratio - 1).max() <= 2.0**-6
+
+
+# --- weights in steps ----------------------------------------------------------------------------------------------
+
+
+def test_what_has_changed_of_a_tile_is_told_in_few_bytes(map_: Map) -> None:
+    kernels = lattice_kernels(2000, seed=3)
+    map_.put((0, 0, 0), kernels)
+    mirror = map_.make_mirror(step=0.0625)
+    whole = mirror.update()
+    map_.put((0, 0, 0), kernels.take(slice(3, None)))
+    fewer = mirror.update()
+    assert fewer.n_bytes < 0.3 * whole.n_bytes
+    assert len(mirror.kernels) == sum(len(kernels) for kernels, _ in map_.tiles.values())
+    held = np.sort(np.rint(lattice_kernels(2000, seed=3).weight_mean[3:] / 0.0625) * 0.0625)
+    here = mirror.kernels
+    inside = ((here.hinge_mean > 0) & (here.hinge_mean < 8)).all(axis=1)
+    np.testing.assert_array_equal(np.sort(here.weight_mean[inside]), held)
+
+
+def test_of_a_tile_that_the_server_has_forgotten_all_comes(map_: Map) -> None:
+    mirror = MapMirror(asking(lambda: map_.state, memory=TileMemory(0)), step=0.0625)
+    mirror.update()
+    map_.put((0, 0, 0), lattice_kernels(300))
+    assert mirror.update().n_kernels == len(map_.tiles[(0, 0, 0)][0])
+    assert len(mirror.kernels) == sum(len(kernels) for kernels, _ in map_.tiles.values())
+
+
+def test_weights_that_no_data_touched_stay_what_they_are() -> None:
+    kernels = lattice_kernels(50)
+    untouched = kernels.replace(weight_var=np.full(len(kernels), 100.0, np.float32))
+    mirror = MapMirror(asking(lambda: tiled_state({(0, 0, 0): (untouched, 1)})), step=0.3)
+    mirror.update()
+    assert (mirror.kernels.weight_var == 100.0).all()
 
 
 # --- what is refused -----------------------------------------------------------------------------------------------
@@ -231,6 +263,59 @@ def test_a_reply_that_does_not_fit_is_refused_and_changes_nothing(
     is_spoilt = False
     assert mirror.update().is_whole
     map_.assert_mirrored(mirror)
+
+
+def packed_i8(*values: int) -> Packed:
+    return pack_array(np.array(values, np.int64))
+
+
+def of_lattice(**fields: Any) -> Spoil:
+    """The first lattice with other fields."""
+
+    def spoil(parts: list[TilesPart]) -> list[TilesPart]:
+        (part,) = parts
+        lattices = [msgspec.structs.replace(part.changes.lattices[0], **fields), *part.changes.lattices[1:]]
+        return [
+            msgspec.structs.replace(part, changes=msgspec.structs.replace(part.changes, lattices=lattices))
+        ]
+
+    return spoil
+
+
+def lattice_twice(parts: list[TilesPart]) -> list[TilesPart]:
+    changes = parts[0].changes
+    twice = msgspec.structs.replace(changes, lattices=[*changes.lattices, *changes.lattices])
+    return [msgspec.structs.replace(parts[0], changes=twice)]
+
+
+def of_what_is_not_held(parts: list[TilesPart]) -> list[TilesPart]:
+    based = pack_array(np.ones(3, np.bool_))
+    return [msgspec.structs.replace(parts[0], changes=msgspec.structs.replace(parts[0].changes, based=based))]
+
+
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        of_lattice(toggled=packed_i8(0)),
+        of_lattice(toggled=packed_i8(1, -1)),
+        of_lattice(toggled=packed_i8(2**62, 2**62, 2**62)),
+        of_lattice(toggled=packed_i8(1)),
+        of_lattice(tiles=packed_i8(99)),
+        of_lattice(tiles=packed_i8(1, 0)),
+        of_lattice(cells=[2**40, 2**40, 2**40]),
+        of_lattice(new_means=packed_i8(1)),
+        of_lattice(mean_changes=packed_i8(1)),
+        of_lattice(shape=pack_array(np.zeros(5, np.float32))),
+        of_lattice(spacing=1e308),
+        lattice_twice,
+        of_what_is_not_held,
+    ],
+)
+def test_changes_that_do_not_fit_are_refused_and_change_nothing(map_: Map, spoil: Spoil) -> None:
+    mirror = MapMirror(asking(lambda: map_.state, spoil=spoil), step=0.0625)
+    with pytest.raises(BadReplyError, match="tiles"):
+        mirror.update()
+    assert mirror.revision is None
 
 
 def test_zero_widths_are_refused(map_: Map) -> None:

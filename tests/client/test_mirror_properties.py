@@ -15,10 +15,12 @@ from potclient.errors import PotclientError
 from potclient.mirror import MapMirror
 from potschemas.messages import DType, Packed, TilesPart
 from potschemas.wire import WireError, pack_array, unpack_array
+from potserver.asking.tile_codes import TileMemory
 from potserver.domain.types import KernelSet
 from tests.tiled_maps import GRID, asking, free_kernels, lattice_kernels, tiled_state
 
 _ELEMENTS = tuple(DType)
+STEP = 0.0625
 INDICES = st.tuples(*[st.integers(-2, 2)] * 3)
 SPACINGS = st.sampled_from([GRID.fine_m, GRID.coarse_m, 0.37])
 
@@ -40,16 +42,20 @@ def kernel_sets(draw: st.DrawFn) -> KernelSet:
     maps=st.lists(st.dictionaries(INDICES, kernel_sets(), max_size=4), min_size=1, max_size=4),
     part_kernels=st.sampled_from([1, 5, 64, 20_000]),
     clears=st.lists(st.booleans(), min_size=4, max_size=4),
+    memory=st.sampled_from([0, 60, 1_000_000]),
     data=st.data(),
 )
 def test_a_mirror_has_the_numbers_of_the_map(
     maps: list[dict[tuple[int, int, int], KernelSet]],
     part_kernels: int,
     clears: list[bool],
+    memory: int,
     data: st.DataObject,
 ) -> None:
     state, epoch = tiled_state({}, epoch=0, revision=0), 0
     mirror = MapMirror(asking(lambda: state, part_kernels=part_kernels))
+    answer = asking(lambda: state, part_kernels=part_kernels, memory=TileMemory(memory))
+    rounded = MapMirror(answer, step=STEP)
     tiles: dict[tuple[int, int, int], tuple[KernelSet, int]] = {}
     for revision, (changed, is_cleared) in enumerate(zip(maps, clears, strict=False), 1):
         if is_cleared:
@@ -60,6 +66,9 @@ def test_a_mirror_has_the_numbers_of_the_map(
         state = tiled_state(tiles, epoch=epoch, revision=revision)
         mirror.update()
         assert_same(mirror, tiles)
+        if data.draw(st.booleans()):  # some look away for a while
+            rounded.update()
+            assert_rounded(rounded, tiles)
 
 
 def assert_same(mirror: MapMirror, tiles: dict[tuple[int, int, int], tuple[KernelSet, int]]) -> None:
@@ -72,6 +81,30 @@ def assert_same(mirror: MapMirror, tiles: dict[tuple[int, int, int], tuple[Kerne
     ]
     arrived, expected = mirror.kernels, KernelSet.concatenate(moved)
     assert rows_of(arrived) == rows_of(expected)
+
+
+def assert_rounded(mirror: MapMirror, tiles: dict[tuple[int, int, int], tuple[KernelSet, int]]) -> None:
+    """The same kernels, their weights off by half a step at most, whatever was held before."""
+    expected = KernelSet.concatenate(
+        [
+            kernels.replace(hinge_mean=kernels.hinge_mean.astype(np.float32).astype(np.float64)).moved(
+                np.array(index) * GRID.size_m
+            )
+            for index, (kernels, _) in tiles.items()
+        ]
+    )
+    arrived = mirror.kernels
+    assert len(arrived) == len(expected)
+    if not len(expected):
+        return
+    shapes = ("hinge_mean", "hinge_var", "gamma_shape", "gamma_rate")
+    mine, theirs = (np.column_stack([getattr(k, name) for name in shapes]) for k in (arrived, expected))
+    # by place and shape; of those that share both, by weight
+    a, b = (np.lexsort([k.weight_mean, *rows.T]) for k, rows in ((arrived, mine), (expected, theirs)))
+    np.testing.assert_array_equal(mine[a], theirs[b])
+    np.testing.assert_allclose(arrived.weight_mean[a], expected.weight_mean[b], atol=0.501 * STEP)
+    apart = np.abs(np.log(arrived.weight_var[a] / expected.weight_var[b]))
+    assert np.median(apart) <= 1.51 * STEP
 
 
 def rows_of(kernels: object) -> list[bytes]:
@@ -112,7 +145,7 @@ def test_a_packed_array_is_all_its_bytes_or_an_error(dtype: DType, shape: list[i
 @given(
     place=st.integers(0, 2**20),
     flip=st.integers(1, 255),
-    field=st.sampled_from(["tiles", "counts", "kernels"]),
+    field=st.sampled_from(["tiles", "counts", "kernels", "changes"]),
 )
 def test_a_damaged_stream_is_an_error_or_numbers_that_fit(place: int, flip: int, field: str) -> None:
     """A flipped byte of any array: refused with a typed error, or a mirror that can be asked."""
@@ -130,9 +163,20 @@ def test_a_damaged_stream_is_an_error_or_numbers_that_fit(place: int, flip: int,
             name = names[place % len(names)]
             kernels = msgspec.structs.replace(part.kernels, **{name: damaged(getattr(part.kernels, name))})
             return [msgspec.structs.replace(part, kernels=kernels)]
+        if field == "changes":
+            lattices = part.changes.lattices
+            spoilt = lattices[place % len(lattices)]
+            names = [n for n in spoilt.__struct_fields__ if isinstance(getattr(spoilt, n), Packed)]
+            name = names[place % len(names)]
+            spoilt = msgspec.structs.replace(spoilt, **{name: damaged(getattr(spoilt, name))})
+            return [
+                msgspec.structs.replace(
+                    part, changes=msgspec.structs.replace(part.changes, lattices=[spoilt])
+                )
+            ]
         return [msgspec.structs.replace(part, **{field: damaged(getattr(part, field))})]
 
-    mirror = MapMirror(asking(lambda: state, spoil=spoil))
+    mirror = MapMirror(asking(lambda: state, spoil=spoil), step=STEP if field == "changes" else None)
     try:
         mirror.update()
     except PotclientError:

@@ -46,7 +46,7 @@ CORNERS = ("--lower", "-2", "-2", "-2", "--upper", "2", "2", "2")
         (["mirror", "--updates", "0"], "--updates"),
         (["mirror", "--lower", "0", "0", "0"], "both corners"),
         (["mirror", "--lower", "0", "0", "0", "--upper", "1", "-1", "1"], "above upper"),
-        (["mirror", "--mantissa-bits", "24"], "2 to 23"),
+        (["mirror", "--step", "24"], "0.0001 to 10"),
         (["atoms", "add", "/nonexistent.atom"], "No such file"),
         (["info", "--map", "No Way"], "not an id"),
         (["info", "--cfg", "nonsense"], "KEY:VALUE"),

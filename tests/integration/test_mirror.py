@@ -84,7 +84,7 @@ def assert_says_what_the_server_says(mirror: Any, client: MapClient, points: Any
 
 
 def test_updates_carry_the_tiles_that_changed_and_no_others(site: Site) -> None:
-    mirror = site.client.mirror()
+    mirror = site.client.mirror(step=None)
     assert mirror.update().n_kernels == 0
     site.scan()
     first = mirror.update()
@@ -111,24 +111,30 @@ def test_updates_carry_the_tiles_that_changed_and_no_others(site: Site) -> None:
 def test_a_box_is_mirrored_so_that_answers_in_it_are_the_map_s(site: Site) -> None:
     site.scan()
     site.scan(30.0)
-    mirror = site.client.mirror([-4, -4, -1], [4, 4, 2])
+    mirror = site.client.mirror([-4, -4, -1], [4, 4, 2], step=None)
     assert mirror.update().n_tiles < len(site.tiles())
     inside = np.random.default_rng(1).uniform([-4, -4, -1], [4, 4, 2], (300, 3))
     assert_says_what_the_server_says(mirror, site.client, inside)
     assert not mirror.occupancy([[30.0, 6.0, 0.0]]).observed.any()
 
 
-def test_rounded_weights_take_fewer_bytes_and_say_nearly_the_same(site: Site) -> None:
+def test_weights_in_steps_take_few_bytes_and_say_nearly_the_same(site: Site) -> None:
     site.scan()
-    exact, short = site.client.mirror(), site.client.mirror(mantissa_bits=7)
-    assert short.update().n_bytes < 0.7 * exact.update().n_bytes
-    change = np.abs(short.occupancy(POINTS).mean - exact.occupancy(POINTS).mean)
+    exact, short = site.client.mirror(step=None), site.client.mirror()
+    assert short.update().n_bytes < 0.5 * exact.update().n_bytes
+    site.scan(0.5)  # most nodes stay, and their weights change a little
+    assert short.update().n_bytes < 0.4 * exact.update().n_bytes
+    here, there = short.occupancy(POINTS), site.client.occupancy(POINTS)
+    both = here.observed & there.observed
+    change = np.abs(here.mean - there.mean)[both]
     assert 0 < change.max() < 0.02
+    np.testing.assert_allclose(here.var[both], there.var[both], atol=0.02)
+    assert (here.observed != there.observed).mean() < 0.01
 
 
 def test_clear_and_restart_begin_another_epoch(site: Site) -> None:
     site.scan()
-    mirror = site.client.mirror()
+    mirror = site.client.mirror(step=None)
     first = mirror.update()
     site.client.control("clear")
     cleared = mirror.update()
@@ -168,7 +174,7 @@ def test_an_update_while_the_map_changes_is_of_one_revision(site: Site) -> None:
 
     thread = threading.Thread(target=drive)
     thread.start()
-    mirror = site.client.mirror()
+    mirror = site.client.mirror(step=None)
     seen: dict[int, KernelSet] = {}
     is_last = False
     while not is_last:
@@ -203,7 +209,7 @@ def test_an_update_while_the_map_changes_is_of_one_revision(site: Site) -> None:
             ErrorCode.BAD_ARRAY,
         ),
         (messages.TilesQuery(lower=[1e9, 0.0, 0.0]), ErrorCode.OUT_OF_RANGE),
-        (messages.TilesQuery(mantissa_bits=1), ErrorCode.BAD_MESSAGE),
+        (messages.TilesQuery(step=0.0), ErrorCode.BAD_MESSAGE),
         (messages.TilesQuery(deadline_ms=1e-6), ErrorCode.DEADLINE),
     ],
 )
@@ -218,7 +224,7 @@ def test_the_limit_of_known_tiles_is_told(real_client: Client) -> None:
 
 
 def test_the_client_refuses_what_makes_no_sense(site: Site) -> None:
-    for arguments in ({"lower": [0, 0, 0]}, {"margin_m": -1.0}, {"mantissa_bits": 24}):
+    for arguments in ({"lower": [0, 0, 0]}, {"margin_m": -1.0}, {"step": 11.0}):
         with pytest.raises(UsageError):
             site.client.mirror(**arguments)
 

@@ -91,7 +91,8 @@ class Map:
         return self.order.heard
 
     def take(self, scan: Scan) -> MapUpdate:
-        update = self.mapper.integrate(scan, commit=lambda: self.store.append(scan))
+        with self.store.keeping(scan) as commit:
+            update = self.mapper.integrate(scan, commit=commit)
         self.order.remember(scan.robot_id, scan.session, scan.seq)
         self.store.advance(self.mapper, self.order.heard)
         return update
@@ -379,7 +380,8 @@ def test_a_map_of_other_tiles_is_refused_and_nothing_changes(tmp_path: Path, ope
 
 def test_nothing_is_kept_in_memory() -> None:
     mapper: Any = None
-    MemoryOnly().append(make_scan(1))
+    with MemoryOnly().keeping(make_scan(1)) as commit:
+        commit()
     for call in (lambda: MemoryOnly().save(None, mapper, {}), lambda: MemoryOnly().load("x", mapper)):
         with pytest.raises(UnsupportedError, match="--store"):
             call()

@@ -54,7 +54,7 @@ def test_a_killed_store_is_read_whole_and_not_touched(tmp_path: Path, open_map: 
     assert contents(left) == before
     state = mapper.state
     for change in (
-        lambda: mapper.integrate(make_scan(4), commit=lambda: store.append(make_scan(4))),
+        lambda: store.keeping(make_scan(4)),
         lambda: mapper.clear(commit=lambda new: store.replace(new, {})),
         lambda: store.save(None, mapper, {}),
         lambda: store.load("x", mapper),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import random
 import shutil
@@ -15,6 +16,7 @@ import pytest
 from potserver.domain.map_state import MapState
 from potserver.errors import MapFileError, StorageError
 from potserver.storage.agreement import JOURNAL, MARK, TILES
+from potserver.storage.journal import scans_after
 from potserver.storage.mark import read_mark
 from potserver.storage.sqlite import log_of, reading, transaction
 
@@ -202,6 +204,28 @@ def test_what_is_removed_at_the_end_is_said(tmp_path: Path, open_map: OpenMap) -
 
 
 # --- whose files they are ---------------------------------------------------------------------------------------------
+
+
+def test_a_scan_counts_only_when_it_enters_the_map(tmp_path: Path, open_map: OpenMap) -> None:
+    """Its bytes are on the disk before; a crash, an error in the middle, or the next scan forget them."""
+    ours = open_map(tmp_path / "store")
+    ours.take(make_scan(1))
+    with pytest.raises(RuntimeError, match="in the middle"), ours.store.keeping(make_scan(7)):
+        raise RuntimeError("in the middle")
+    with ours.store.keeping(make_scan(8)):
+        pass  # never committed; staged when the block has ended
+    left = ours.crash(tmp_path / "left")
+    assert scans_after(left / "default" / JOURNAL, 0) == 1
+    again = open_map(left)
+    assert (again.state.n_scans, again.restored.n_replayed) == (1, 1)
+    again.take(make_scan(2))
+    ours.take(make_scan(2))
+    for journal in (ours.crash(tmp_path / "more"), again.crash(tmp_path / "others")):
+        restored = open_map(journal)
+        assert (restored.state.n_scans, restored.restored.n_replayed) == (2, 2)
+    ours.store.close()
+    with contextlib.closing(sqlite3.connect(tmp_path / "store" / "default" / JOURNAL)) as connection:
+        assert connection.execute("SELECT COUNT(*) FROM scans").fetchone() == (0,)
 
 
 def test_a_store_is_for_its_owner_alone(tmp_path: Path, open_map: OpenMap) -> None:

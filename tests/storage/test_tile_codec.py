@@ -124,3 +124,14 @@ def test_a_sound_checksum_does_not_make_a_sound_tile() -> None:
         with pytest.raises(MapFileError):
             decode_tile(encode_tile((0, 0, 0), each), GRID, 3)
     decode_tile(encode_tile((0, 0, 0), tile), GRID, 3)
+
+
+def test_a_tile_s_arrays_are_its_own() -> None:
+    """A view would keep all bytes that the tile was read from."""
+    _, tile = decode_tile(encode_tile((0, 0, 0), make_tile(50, 40)), GRID, 3)
+    for array in arrays_of(tile):
+        base = array
+        while isinstance(base.base, np.ndarray):
+            base = base.base
+        assert base.base is None
+        assert base.nbytes == array.nbytes

@@ -14,6 +14,7 @@ from potclient.commands.output_files import output_file
 from potclient.commands.shared import EXIT_OK, add_box_arguments, add_command, client_of, note, positive, say
 from potclient.errors import LostReplyError, NoServerError, QueryTimeoutError, UsageError
 from potclient.mirror import MapMirror, MirrorUpdate
+from potclient.questions.tiles import MIRROR_STEP
 
 # `mirror` asks so often even if nothing was announced: a server that was restarted announces nothing
 _POLL_S = 2.0
@@ -28,17 +29,19 @@ def add(commands: Any) -> None:
         description="""Fetch the map's kernels, then only the tiles that change, and print a line an update. Follows the map
 until interrupted, or --seconds or --updates are over. When the server was restarted or the map cleared, all comes anew.
 
---mantissa-bits rounds the weights, which are most of the bytes: with 7 bits an update takes half of them and probabilities
-move by up to a hundredth, with 10 bits two thirds and a thousandth.""",
+Weights are rounded to --step, 1/16 log-odds by default: few bytes then tell what has changed, and probabilities are within .02
+of the server's. --exact takes weights as they are, at eight times the bytes.""",
         epilog="""examples:
   potclient mirror                               follow the whole map
   potclient mirror --once -o map.npz             the map as it is now; `potclient.KernelSet.load` reads it
   potclient mirror --lower -10 -10 -1 --upper 10 10 3 --json""",
     )
     add_box_arguments(parser, "corner of the box to follow, m, map frame (default: all of the map)")
-    parser.add_argument(
-        "--mantissa-bits", type=int, metavar="N", help="of the weights, 2 to 23 (default: all)"
+    rounding = parser.add_mutually_exclusive_group()
+    rounding.add_argument(
+        "--step", type=positive, metavar="S", default=MIRROR_STEP, help=f"log-odds (default {MIRROR_STEP})"
     )
+    rounding.add_argument("--exact", action="store_true", help="weights as they are")
     parser.add_argument("--once", action="store_true", help="fetch it once and stop")
     parser.add_argument("--seconds", type=positive, metavar="S", help="stop after S seconds (default: never)")
     parser.add_argument("--updates", type=int, metavar="N", help="stop after N updates")
@@ -55,7 +58,8 @@ def run(arguments: argparse.Namespace) -> int:
     until = None if arguments.seconds is None else time.monotonic() + arguments.seconds
     changed = threading.Event()
     with client_of(arguments) as client:
-        mirror = client.mirror(arguments.lower, arguments.upper, mantissa_bits=arguments.mantissa_bits)
+        step = None if arguments.exact else arguments.step
+        mirror = client.mirror(arguments.lower, arguments.upper, step=step)
         client.watch_revisions(lambda _: changed.set())
         try:
             for n, (update, took_s) in enumerate(_updates(mirror, changed, until), 1):

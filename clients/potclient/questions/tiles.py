@@ -14,6 +14,7 @@ from potclient.link import Link, decoded
 from potclient.mirror import MapMirror
 from potschemas.messages import TilesPart, TilesQuery
 
+MIRROR_STEP = 0.0625  # log-odds: a probability is off by .001 on average
 MIRROR_MARGIN_M = 4.0  # kernels of the coarsest maps are 1 m apart, and say nothing any more at 2.5 m
 
 
@@ -23,7 +24,7 @@ def mirror(
     upper: ArrayLike | None,
     *,
     margin_m: float,
-    mantissa_bits: int | None,
+    step: float | None,
     timeout_s: float | None,
 ) -> MapMirror:
     """See `MapClient.mirror`."""
@@ -31,8 +32,8 @@ def mirror(
         raise UsageError("mirror: give both corners, or neither for the whole map")
     if not (math.isfinite(margin_m) and margin_m >= 0):
         raise UsageError(f"margin_m is {margin_m}, need 0 or a positive number of metres")
-    if mantissa_bits is not None and not 2 <= mantissa_bits <= 23:
-        raise UsageError(f"mantissa_bits is {mantissa_bits}, need 2 to 23")
+    if step is not None and not 1e-4 <= step <= 10.0:
+        raise UsageError(f"step is {step}, need 0.0001 to 10 log-odds, or None")
     box = {}
     if lower is not None and upper is not None:
         low, high = corner(lower, "lower"), corner(upper, "upper")
@@ -45,4 +46,4 @@ def mirror(
         for sample in link.samples(link.keys.query("tiles"), query, timeout_s):
             yield decoded(sample.payload, TilesPart), len(sample.payload)
 
-    return MapMirror(ask, **box, mantissa_bits=mantissa_bits)
+    return MapMirror(ask, **box, step=step)

@@ -11,6 +11,7 @@ import numpy as np
 from potschemas import messages
 from potserver.adapters.audit import Audit
 from potserver.asking.plan import Plan
+from potserver.asking.tile_codes import TileMemory
 from potserver.atoms.store import AtomStore
 from potserver.domain.kernel_map import KernelMap
 from potserver.domain.map_state import MapState
@@ -34,6 +35,7 @@ class Served:
     audit: Audit
     limits: Limits
     durable: bool  # accepted clouds survive a crash
+    tiles: TileMemory = dataclasses.field(default_factory=TileMemory)  # as they were sent to mirrors
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)

@@ -7,9 +7,10 @@ import numpy as np
 from potschemas import messages, wire
 from potschemas.messages import DType
 from potserver.adapters.questions.question import Asked, Question
-from potserver.asking.tiles import MANTISSA_BITS, KnownTiles, TileRun, Tiles, TilesPlan
+from potserver.asking.tiles import KnownTiles, TileRun, Tiles, TilesPlan
 from potserver.codec.base import typed_errors
 from potserver.codec.kernels import code_kernels
+from potserver.codec.tile_changes import code_changes
 from potserver.errors import BadMessageError
 from potserver.limits import Limits
 
@@ -34,8 +35,8 @@ def decode_tiles(query: messages.TilesQuery) -> Tiles:
                 max_elements=4 * Limits.max_query_tiles,
             )
         known = KnownTiles(query.epoch, columns[:3].T, columns[3])
-    bits = MANTISSA_BITS if query.mantissa_bits is None else query.mantissa_bits
-    return Tiles(known, query.lower, query.upper, bits)
+    step = None if query.step is messages.ABSENT else query.step
+    return Tiles(known, query.lower, query.upper, step)
 
 
 def encode_part(plan: TilesPlan, number: int, run: TileRun) -> messages.TilesPart:
@@ -51,13 +52,14 @@ def encode_part(plan: TilesPlan, number: int, run: TileRun) -> messages.TilesPar
         counts=wire.pack_array(run.counts),
         gone=wire.pack_array(plan.gone.T) if number == 0 and len(plan.gone) else None,
         kernels=code_kernels(run.kernels, plan.spacings_m),
+        changes=messages.ABSENT if plan.coding is None else code_changes(run.changes, plan.coding.steps),
         **plan.rule.fields(),
     )
 
 
 def _plan(asked: Asked, query: messages.TilesQuery) -> TilesPlan:
     size_m = asked.served.mapper.settings.tile_size_m
-    return decode_tiles(query).plan(asked.state, asked.limits, tile_size_m=size_m)
+    return decode_tiles(query).plan(asked.state, asked.limits, asked.served.tiles, tile_size_m=size_m)
 
 
 # the plan looks at every tile of the map
