@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from potschemas.answers import AnswerRule
+from potschemas.lean import LeanTiles
 from potserver.asking.plan import Plan, checked_box
 from potserver.domain.map_state import MapState
 from potserver.domain.tiles import Tile, TileIndex
@@ -48,7 +49,7 @@ class Tiles:
     def plan(
         self, state: MapState, limits: Limits, *, tile_size_m: float, part_kernels: int = PART_KERNELS
     ) -> TilesPlan:
-        """Check the question, and compare. A tile without kernels says nothing and counts as none.
+        """Check the question, and compare. A tile without kernels and lean says nothing and counts as none.
 
         Args:
             state: Of the map.
@@ -104,6 +105,14 @@ class TileRun(NamedTuple):
     revisions: Int64  # (T,)
     counts: Int64  # (T,) kernels of each, at least 1
     kernels: KernelSet  # relative to the lower corners of their tiles
+    leans: Leans | None  # none where no tile has one
+
+
+class Leans(NamedTuple):
+    """The leans of some tiles that differ, and the revisions of these."""
+
+    told: LeanTiles
+    revisions: tuple[int, ...]
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -116,7 +125,7 @@ class TilesPlan(Plan[TileRun]):
     tile_size_m: float
     spacings_m: tuple[float, ...]  # of the lattices that most of the map's kernels are on
     is_whole: bool  # all tiles of the box, because what the asker has is of another epoch
-    tiles: tuple[tuple[TileIndex, Tile], ...]  # that differ, each with kernels
+    tiles: tuple[tuple[TileIndex, Tile], ...]  # that differ, each with kernels or a lean
     gone: Int64  # (G, 3) tiles that the asker has and the map has not
     mantissa_bits: int
     part_size: int
@@ -150,7 +159,16 @@ class TilesPlan(Plan[TileRun]):
             np.array([self.tiles[t][1].revision for t in members], np.int64),
             counts[members],
             kernels,
+            self._leans(i),
         )
+
+    def _leans(self, i: int) -> Leans | None:
+        """Those that travel with a part: each tile's once."""
+        leaning = [(index, tile) for index, tile in self.tiles if tile.lean is not None][i :: self.n_parts]
+        if not leaning:
+            return None
+        nodes = {index: tile.lean for index, tile in leaning if tile.lean is not None}
+        return Leans(LeanTiles(self.tile_size_m, nodes), tuple(tile.revision for _, tile in leaning))
 
 
 def rounded(values: Float32, bits: int) -> Float32:
@@ -166,8 +184,8 @@ def rounded(values: Float32, bits: int) -> Float32:
 
 
 def _present(tiles: Mapping[TileIndex, Tile], low: Int64 | None, high: Int64 | None) -> dict[TileIndex, Tile]:
-    """The tiles in a box that have kernels."""
-    everywhere = {index: tile for index, tile in tiles.items() if len(tile.kernels)}
+    """The tiles in a box that have kernels or a lean."""
+    everywhere = {i: tile for i, tile in tiles.items() if len(tile.kernels) or tile.lean is not None}
     inside = _inside(np.array(list(everywhere), np.int64).reshape(-1, 3), low, high)
     return {index: everywhere[index] for index, is_in in zip(everywhere, inside, strict=True) if is_in}
 

@@ -9,7 +9,7 @@ from potschemas.messages import DType
 from potserver.adapters.questions.question import Asked, Question
 from potserver.asking.tiles import MANTISSA_BITS, KnownTiles, TileRun, Tiles, TilesPlan
 from potserver.codec.base import typed_errors
-from potserver.codec.kernels import code_kernels
+from potserver.codec.kernels import code_kernels, encode_lean
 from potserver.errors import BadMessageError
 from potserver.limits import Limits
 
@@ -51,6 +51,7 @@ def encode_part(plan: TilesPlan, number: int, run: TileRun) -> messages.TilesPar
         counts=wire.pack_array(run.counts),
         gone=wire.pack_array(plan.gone.T) if number == 0 and len(plan.gone) else None,
         kernels=code_kernels(run.kernels, plan.spacings_m),
+        lean=messages.ABSENT if run.leans is None else encode_lean(*run.leans),
         **plan.rule.fields(),
     )
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import collections
+import contextlib
 import dataclasses
 import functools
 from collections.abc import Callable, Iterator
@@ -13,12 +14,16 @@ from potserver.atoms.build.engines import Engine
 from potserver.atoms.build.recipe import Recipe, located
 from potserver.atoms.build.scan_task import Candidate, Progress, ScanResult, ScanTask, learn_scan
 from potserver.atoms.cover import greedy_cover
+from potserver.atoms.heights import learn_heights
 from potserver.domain.dictionary import AtomDictionary
-from potserver.errors import DictionaryError
-from potserver.recordings import open_recording
+from potserver.domain.types import Scan
+from potserver.errors import DictionaryError, PotserverError
+from potserver.numerics.heights import HeightModel
+from potserver.recordings import open_recording, to_scan
 
 COVERED = "near a kept atom"
 OVER_LIMIT = "beyond max_atoms"
+_MOST_TOLD = 48  # scans that heights are learned from
 
 
 @dataclasses.dataclass(slots=True)
@@ -131,7 +136,21 @@ def build(
     for dims in (3, 2):
         _choose(recipe, dims, candidates, reports, threads, on_chosen)
     atoms = [candidate.atom for report in reports for candidate in report.kept]
-    return Built(dictionary=AtomDictionary(tuple(atoms)), reports=reports)
+    return Built(dictionary=AtomDictionary(atoms, heights=heights_of(recipe, tasks)), reports=reports)
+
+
+def heights_of(recipe: Recipe, tasks: list[ScanTask]) -> HeightModel | None:
+    """What the scans of a recipe say of heights above the ground; of very many, some tell. None if none can."""
+    deep = [task for task in tasks if task.dims != 2]
+    told = deep[:: -(-len(deep) // _MOST_TOLD) or 1]
+    reach = max((task.settings.max_range_m for task in told), default=0.0)
+    return learn_heights(_readable(told), max_range_m=reach, seed=recipe.seed)
+
+
+def _readable(tasks: list[ScanTask]) -> Iterator[Scan]:
+    for task in tasks:
+        with contextlib.suppress(DatasetError, PotserverError, OSError):  # the task itself reports it
+            yield to_scan(open_recording(task.dataset, task.reader)[task.number], task.number)
 
 
 def _choose(
