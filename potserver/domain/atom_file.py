@@ -1,7 +1,7 @@
 """The file of an atom dictionary, `*.atoms`: a safetensors container that any reader of that format opens.
 
     header    names, dtypes, shapes and places of the arrays; one metadata entry, a canonical JSON of the version, per atom
-              id, dims, radius_m, azimuth_width_rad and provenance, and maybe the height model of the scans
+              id, dims, radius_m, azimuth_width_rad and provenance, and maybe the height models of the recordings
     int64     hit_offsets, free_offsets, kernel_offsets (A + 1,): atom i has the rows offsets[i] to offsets[i + 1]
     float32   hit_points (H, 3), free_points (F, 3) and the kernels' arrays, of all atoms one after the other
     uint8     sha256 (32,): of every byte of the file before it
@@ -31,7 +31,7 @@ from safetensors.numpy import save as to_safetensors
 from potserver.domain.folders import sync_folder
 from potserver.domain.types import KERNEL_ARRAYS, Atom, KernelSet
 from potserver.errors import BadPointsError, DictionaryError, EmptyError, ShapeError
-from potserver.numerics.heights import HeightModel
+from potserver.numerics.heights import HeightModels
 
 VERSION = 2
 _METADATA_KEY = "potserver-atoms"  # one key: safetensors keeps no order between several
@@ -64,7 +64,7 @@ class AtomFile:
         self,
         path: Path,
         records: list[AtomRecord],
-        heights: HeightModel | None,
+        heights: HeightModels | None,
         arrays: dict[str, NDArray[Any]],
     ) -> None:
         self.path, self.records, self.heights, self._arrays = path, records, heights, arrays
@@ -92,7 +92,7 @@ class AtomFile:
             raise DictionaryError(f"{self.path}: atom {record.atom_id!r}: {error}") from error
 
 
-def write_atoms(path: Path, atoms: Sequence[Atom], heights: HeightModel | None = None) -> None:
+def write_atoms(path: Path, atoms: Sequence[Atom], heights: HeightModels | None = None) -> None:
     """Write a file whole or not at all; it is on the disk when this returns, and replaces an open one without harm.
 
     Raises:
@@ -151,7 +151,7 @@ def open_atoms(path: Path, *, verify: bool = True) -> AtomFile:
     return AtomFile(path, records, heights, _map_arrays(path, mapped, described, len(records)))
 
 
-def _image(atoms: Sequence[Atom], heights: HeightModel | None) -> bytes:
+def _image(atoms: Sequence[Atom], heights: HeightModels | None) -> bytes:
     arrays: dict[str, NDArray[Any]] = {
         "hit_offsets": _offsets([len(atom.hit_points) for atom in atoms]),
         "free_offsets": _offsets([len(atom.free_points) for atom in atoms]),
@@ -216,7 +216,7 @@ def _map_arrays(
     return arrays
 
 
-def _parse_metadata(path: Path, text: str) -> tuple[list[AtomRecord], HeightModel | None]:
+def _parse_metadata(path: Path, text: str) -> tuple[list[AtomRecord], HeightModels | None]:
     try:
         tree = json.loads(text)
     except (ValueError, RecursionError) as error:
@@ -231,15 +231,16 @@ def _parse_metadata(path: Path, text: str) -> tuple[list[AtomRecord], HeightMode
     return records, _parse_heights(path, tree["heights"]) if "heights" in tree else None
 
 
-def _parse_heights(path: Path, told: object) -> HeightModel:
+def _parse_heights(path: Path, told: object) -> HeightModels:
     try:
-        model = HeightModel(
+        model = HeightModels(
             **{name: np.array(values, np.float64) for name, values in cast("dict[str, Any]", told).items()}
         )
         sound = (
             model.heights_m.ndim == model.ranges_m.ndim == 1
-            and model.log_odds.shape == (len(model.heights_m), len(model.ranges_m))
-            and min(model.log_odds.shape) >= 2
+            and model.log_odds.shape == (len(model.log_odds), len(model.heights_m), len(model.ranges_m))
+            and len(model.log_odds) > 0
+            and min(model.log_odds.shape[1:]) >= 2
             and (np.diff(model.heights_m) > 0).all()
             and (np.diff(model.ranges_m) > 0).all()
             and all(np.isfinite(values).all() for values in model)
@@ -247,7 +248,7 @@ def _parse_heights(path: Path, told: object) -> HeightModel:
     except (TypeError, ValueError, AttributeError):
         sound = False
     if not sound:
-        raise DictionaryError(f"{path}: the height model is incomplete, or its numbers are no model's")
+        raise DictionaryError(f"{path}: the height models are incomplete, or their numbers are no models'")
     return model
 
 

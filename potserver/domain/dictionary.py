@@ -10,7 +10,7 @@ from pathlib import Path
 from potserver.domain.atom_file import AtomFile, open_atoms, write_atoms
 from potserver.domain.types import Atom
 from potserver.errors import DictionaryError, UnknownAtomError
-from potserver.numerics.heights import HeightModel
+from potserver.numerics.heights import HeightModels
 
 
 class AtomDictionary:
@@ -19,7 +19,7 @@ class AtomDictionary:
     Atoms of a file stay in it until they are asked for, so that thousands of them open at once.
     """
 
-    def __init__(self, atoms: Iterable[Atom] = (), *, heights: HeightModel | None = None) -> None:
+    def __init__(self, atoms: Iterable[Atom] = (), *, heights: HeightModels | None = None) -> None:
         """Hold atoms.
 
         Args:
@@ -32,7 +32,7 @@ class AtomDictionary:
         self.heights = heights
 
     @classmethod
-    def _of(cls, slots: Iterable[Atom | _StoredAtom], heights: HeightModel | None) -> AtomDictionary:
+    def _of(cls, slots: Iterable[Atom | _StoredAtom], heights: HeightModels | None) -> AtomDictionary:
         dictionary = cls(heights=heights)
         dictionary._slots = _by_id(slots)
         return dictionary

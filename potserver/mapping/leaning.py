@@ -13,14 +13,14 @@ import numpy as np
 
 from potschemas.lean import Bytes, to_bytes
 from potserver.domain.tiles import TileGrid, TileIndex
-from potserver.domain.types import Float64
+from potserver.domain.types import Bool, Float64
 from potserver.numerics.beams import Beams, LabelledPoints, beam_weights
-from potserver.numerics.heights import Ground, HeightModel, ground_of
+from potserver.numerics.heights import Ground, HeightLabels, HeightModel, HeightModels, ground_of
 
 _JUDGED = 4_000  # labelled points, at most
 _EYE_M = (0.3, 5.0)  # heights of a sensor above the ground that the models know
 _STEEPEST = 0.3  # slope of a ground
-_LEAST_GROUND = 12  # cells of a scan's surroundings that lie on one plane
+_LEAST_GROUND = 6  # cells of a scan's surroundings that lie on one plane
 _SURE_OF_MODEL = 5.0  # precision of the scale about 1
 _LEAST_SCALE = 0.25  # with less of it, the model does not fit here
 _REACH_M = (-2.0, 6.0)  # heights between which a tile has something to lean on
@@ -55,18 +55,18 @@ class Expectation(NamedTuple):
 
 
 def expect(
-    model: HeightModel | None, beams: Beams, labelled: LabelledPoints, origin: Float64, *, planar: bool
+    models: HeightModels | None, beams: Beams, labelled: LabelledPoints, origin: Float64, *, planar: bool
 ) -> Expectation:
-    """What the dictionary's model says about a scan's surroundings.
+    """What the dictionary's models say about a scan's surroundings.
 
     Args:
-        model: Of the dictionary.
+        models: Of the dictionary; those count most that make the scan's own labels likely.
         beams: Relative to the sensor, with the map's axes.
         labelled: Points on them, map frame.
         origin: (3,) m, map frame: the sensor.
         planar: A 2D scan has no heights.
     """
-    if model is None:
+    if models is None:
         return Expectation(None, NO_MODEL)
     if planar:
         return Expectation(None, PLANAR)
@@ -80,17 +80,22 @@ def expect(
         or not _EYE_M[0] <= -ground.height_m <= _EYE_M[1]
     ):
         return Expectation(None, NO_GROUND)
-    expected = Expected(model, ground, origin, 1.0)
-    every = -(-len(labelled.points) // _JUDGED)
-    judged = slice(None, None, every)
-    log_odds = expected.at(labelled.points[judged])
-    scale = _scale(log_odds, labelled.occupied[judged].astype(np.float64), beam_weights(labelled)[judged])
+    judged = slice(None, None, -(-len(labelled.points) // _JUDGED))
+    about = labelled.points[judged] - origin
+    labels = HeightLabels(
+        ground.below(about),
+        np.hypot(about[:, 0], about[:, 1]),
+        labelled.occupied[judged],
+        beam_weights(labelled)[judged],
+    )
+    model = models.likeliest(labels)
+    scale = _scale(model.at(labels.height_m, labels.range_m), labels.occupied, labels.weight)
     if scale < _LEAST_SCALE:
         return Expectation(None, NOVEL)
-    return Expectation(expected._replace(scale=min(scale, 1.0)), None)
+    return Expectation(Expected(model, ground, origin, min(scale, 1.0)), None)
 
 
-def _scale(log_odds: Float64, occupied: Float64, weight: Float64) -> float:
+def _scale(log_odds: Float64, occupied: Bool, weight: Float64) -> float:
     """By how much log-odds are best multiplied to explain labels: 1 if these say nothing against it."""
     scale = 1.0
     for _ in range(8):

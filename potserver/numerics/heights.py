@@ -21,6 +21,8 @@ _ALIKE_ALONG_HEIGHT, _ALIKE_ALONG_RANGE = (
 _PRIOR_PRECISION = 0.02
 _FIT_STEPS, _LONGEST_STEP = 25, 2.0
 _LEAST_CURVATURE = 1e-4
+_WORTH = 0.05  # of a label: those of one scan repeat each other
+_SURE = 8.0  # log-odds that count no more when models are compared
 _CELL_M = 2.0  # of each cell the lowest hit is looked at
 _ABOVE_M, _BELOW_M = (
     0.15,
@@ -45,6 +47,35 @@ class HeightModel(NamedTuple):
         low = f[i, j] + t * (f[i, j + 1] - f[i, j])
         high = f[i + 1, j] + t * (f[i + 1, j + 1] - f[i + 1, j])
         return np.asarray(low + s * (high - low))
+
+
+class HeightModels(NamedTuple):
+    """Models of several kinds of places, with the same knots."""
+
+    heights_m: Float64  # (A,) ascending
+    ranges_m: Float64  # (B,) ascending
+    log_odds: Float64  # (M, A, B)
+
+    def likeliest(self, labels: HeightLabels) -> HeightModel:
+        """The mean of the models' log-odds, each weighed by how likely it makes labels."""
+        models = [HeightModel(self.heights_m, self.ranges_m, table) for table in self.log_odds]
+        nats = np.array([labels.log_likelihood(model) for model in models]) * _WORTH
+        share = np.exp(nats - nats.max())
+        return models[0]._replace(log_odds=np.tensordot(share / share.sum(), self.log_odds, 1))
+
+
+class HeightLabels(NamedTuple):
+    """N labelled points, as height models see them."""
+
+    height_m: Float64  # (N,) above the ground
+    range_m: Float64  # (N,) from the sensor, horizontally
+    occupied: Bool  # (N,)
+    weight: Float64  # (N,) how much each counts
+
+    def log_likelihood(self, model: HeightModel) -> float:
+        """Of the labels under a model, nats."""
+        log_odds = np.clip(model.at(self.height_m, self.range_m), -_SURE, _SURE)
+        return -float((self.weight * np.logaddexp(0.0, np.where(self.occupied, -log_odds, log_odds))).sum())
 
 
 class Ground(NamedTuple):
@@ -86,14 +117,10 @@ def ground_of(hits: Float64) -> Ground:
     return Ground(height, slope_x, slope_y, int(is_near.sum()))
 
 
-def fit_heights(height_m: Float64, range_m: Float64, occupied: Bool, weight: Float64) -> HeightModel:
-    """The model that explains labelled points best, smooth from knot to knot.
-
-    Args:
-        height_m, range_m: (N,) of each point.
-        occupied: (N,) its label.
-        weight: (N,) how much it counts.
-    """
+def fit_heights(labels: HeightLabels) -> HeightModel:
+    """The model that explains labels best, smooth from knot to knot."""
+    height_m, range_m, occupied, weight = labels
+    weight = _WORTH * weight
     heights, ranges = np.array(HEIGHTS_M), np.array(RANGES_M)
     i, s = _between(height_m, heights)
     j, t = _between(range_m, ranges)

@@ -19,7 +19,7 @@ from potserver.domain import atom_file
 from potserver.domain.dictionary import AtomDictionary
 from potserver.domain.types import Atom, KernelSet
 from potserver.errors import DictionaryError, UnknownAtomError
-from potserver.numerics.heights import HeightModel
+from potserver.numerics.heights import HeightModels
 
 _KERNEL_ARRAYS = [f.name for f in dataclasses.fields(KernelSet)]
 
@@ -107,8 +107,10 @@ def test_the_file_holds_everything(atoms: AtomDictionary, path: Path) -> None:
         assert_equal(before, after)
 
 
-def test_the_height_model_is_kept_through_files_and_changes(atoms: AtomDictionary, tmp_path: Path) -> None:
-    model = HeightModel(np.array([-1.0, 0.0, 2.5]), np.array([0.0, 9.0]), np.arange(6.0).reshape(3, 2) / 7)
+def test_height_models_are_kept_through_files_and_changes(atoms: AtomDictionary, tmp_path: Path) -> None:
+    model = HeightModels(
+        np.array([-1.0, 0.0, 2.5]), np.array([0.0, 9.0]), np.arange(12.0).reshape(2, 3, 2) / 7
+    )
     changed = AtomDictionary(atoms, heights=model).remove(atoms.atoms[0].atom_id).of_dims(3)
     changed.save(tmp_path / "a.atoms")
     again = AtomDictionary.load(tmp_path / "a.atoms").heights
@@ -118,7 +120,7 @@ def test_the_height_model_is_kept_through_files_and_changes(atoms: AtomDictionar
     assert atoms.heights is None
     broken = AtomDictionary(atoms, heights=model._replace(heights_m=np.array([1.0, 0.0, 2.0])))
     broken.save(tmp_path / "b.atoms")
-    with pytest.raises(DictionaryError, match="height model"):
+    with pytest.raises(DictionaryError, match="height models"):
         AtomDictionary.load(tmp_path / "b.atoms")
 
 

@@ -21,6 +21,7 @@ import pytest
         "learner_curves",
         "mirror",
         "sessions",
+        "thin",
         "torture",
     ],
 )

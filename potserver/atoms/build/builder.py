@@ -18,12 +18,12 @@ from potserver.atoms.heights import learn_heights
 from potserver.domain.dictionary import AtomDictionary
 from potserver.domain.types import Scan
 from potserver.errors import DictionaryError, PotserverError
-from potserver.numerics.heights import HeightModel
+from potserver.numerics.heights import HeightModels
 from potserver.recordings import open_recording, to_scan
 
 COVERED = "near a kept atom"
 OVER_LIMIT = "beyond max_atoms"
-_MOST_TOLD = 48  # scans that heights are learned from
+_TOLD_BY = 16  # scans of a recording, at most, that heights are learned from
 
 
 @dataclasses.dataclass(slots=True)
@@ -139,18 +139,20 @@ def build(
     return Built(dictionary=AtomDictionary(atoms, heights=heights_of(recipe, tasks)), reports=reports)
 
 
-def heights_of(recipe: Recipe, tasks: list[ScanTask]) -> HeightModel | None:
-    """What the scans of a recipe say of heights above the ground; of very many, some tell. None if none can."""
-    deep = [task for task in tasks if task.dims != 2]
-    told = deep[:: -(-len(deep) // _MOST_TOLD) or 1]
-    reach = max((task.settings.max_range_m for task in told), default=0.0)
-    return learn_heights(_readable(told), max_range_m=reach, seed=recipe.seed)
+def heights_of(recipe: Recipe, tasks: list[ScanTask]) -> HeightModels | None:
+    """What the recordings of tasks say of heights above the ground, by scans from all over each; None if none can tell."""
+    deep = {task.recording: task for task in tasks if task.dims != 2}
+    reach = max((task.settings.max_range_m for task in deep.values()), default=0.0)
+    scans = (_scans_about(task) for task in deep.values())
+    return learn_heights(scans, max_range_m=reach, seed=recipe.seed)
 
 
-def _readable(tasks: list[ScanTask]) -> Iterator[Scan]:
-    for task in tasks:
-        with contextlib.suppress(DatasetError, PotserverError, OSError):  # the task itself reports it
-            yield to_scan(open_recording(task.dataset, task.reader)[task.number], task.number)
+def _scans_about(task: ScanTask) -> Iterator[Scan]:
+    """Some scans of a task's recording, evenly spread; what cannot be read is left out, for its own task reports it."""
+    recording = open_recording(task.dataset, task.reader)
+    for number in range(0, len(recording), -(-len(recording) // _TOLD_BY)):
+        with contextlib.suppress(DatasetError, PotserverError, OSError):
+            yield to_scan(recording[number], number)
 
 
 def _choose(
