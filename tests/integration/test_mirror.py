@@ -131,6 +131,11 @@ def test_a_map_that_leans_is_mirrored_with_its_lean(site: Site) -> None:
         assert (own.mean[~own.observed] == 0.5).all()
         np.testing.assert_allclose(mirror.occupancy(points, evidence_only=True).mean, own.mean, atol=0.02)
     assert mirror.update().is_empty
+    assert "not_leaning.no_ground" not in site.client.stats().counters
+    wall = np.column_stack([np.full(500, 6.0), rng.uniform(-6, 6, 500), rng.uniform(1, 5, 500)])
+    site.client.integrate(wall.astype(np.float32), pose, stamp_ns=3 * 10**9)
+    assert site.client.stats().counters["not_leaning.no_ground"] == 1
+    mirror.update()
     whole = site.client.params()
     np.testing.assert_allclose(whole.occupancy(points).mean, mirror.occupancy(points).mean, atol=1e-5)
     cells = site.client.grid([30, -4, -2], [34, 4, 0], 0.5)

@@ -149,7 +149,10 @@ def heights_of(recipe: Recipe, tasks: list[ScanTask]) -> HeightModels | None:
 
 def _scans_about(task: ScanTask) -> Iterator[Scan]:
     """Some scans of a task's recording, evenly spread; what cannot be read is left out, for its own task reports it."""
-    recording = open_recording(task.dataset, task.reader)
+    try:
+        recording = open_recording(task.dataset, task.reader)
+    except (DatasetError, OSError):
+        return
     for number in range(0, len(recording), -(-len(recording) // _TOLD_BY)):
         with contextlib.suppress(DatasetError, PotserverError, OSError):
             yield to_scan(recording[number], number)
