@@ -268,7 +268,12 @@ class MapClient:
     # --- questions ------------------------------------------------------------------------------------------------------------
 
     def occupancy(
-        self, points: ArrayLike, *, with_gradient: bool = False, timeout_s: float | None = None
+        self,
+        points: ArrayLike,
+        *,
+        with_gradient: bool = False,
+        evidence_only: bool = False,
+        timeout_s: float | None = None,
     ) -> Occupancy:
         """How likely each point is occupied, and how sure the map is.
 
@@ -278,12 +283,14 @@ class MapClient:
         Args:
             points: (N, 3), or (N, 2) with z = 0; m, map frame. float32 input travels as float32.
             with_gradient: Bring the gradients of the mean and of the latent mean too.
-            timeout_s: Of one query; None takes the client's. Parts of a split request queue behind each other and may take
-                four times as long.
+            evidence_only: Borrow nothing from what the dictionary expects: what is not observed is unknown.
+            timeout_s: Of one query; None takes the client's. Parts of a split request queue and may take four times as long.
         Raises:
             MapServerError, NoServerError, QueryTimeoutError, LostReplyError, UsageError: see there.
         """
-        return self._points.occupancy(points, with_gradient=with_gradient, timeout_s=timeout_s)
+        return self._points.occupancy(
+            points, with_gradient=with_gradient, evidence_only=evidence_only, timeout_s=timeout_s
+        )
 
     def grid(
         self,
@@ -291,6 +298,7 @@ class MapClient:
         upper: ArrayLike,
         resolution: float,
         *,
+        evidence_only: bool = False,
         progress: ProgressCallback | None = None,
         timeout_s: float | None = None,
     ) -> Grid:
@@ -299,13 +307,15 @@ class MapClient:
         Args:
             lower, upper: (3,) m, map frame.
             resolution: Cell edge, m.
+            evidence_only: As for `occupancy`.
             progress: Called with (parts received, parts in all) as they stream in.
             timeout_s: For the whole grid; None takes the client's.
         Raises:
             IncompleteReplyError: parts are missing, doubled, or from different revisions.
             MapServerError, NoServerError, QueryTimeoutError, LostReplyError, UsageError: see there.
         """
-        return grid.grid(self._link, lower, upper, resolution, progress=progress, timeout_s=timeout_s)
+        wanted = grid.Wanted(lower, upper, resolution, evidence_only)
+        return grid.grid(self._link, wanted, progress=progress, timeout_s=timeout_s)
 
     def rays(
         self,

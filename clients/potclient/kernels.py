@@ -16,10 +16,12 @@ from potclient.arguments import as_points
 from potclient.arrays import Bool, Float32, Float64, arrays_of
 from potclient.errors import BadReplyError, UsageError
 from potclient.files import save_npz
+from potclient.lean import lean_from_message, lean_to_message
 from potclient.occupancy import Occupancy
 from potschemas import answers
 from potschemas.answers import RULE_FIELDS, AnswerRule, LatentGradients, LatentSums
-from potschemas.messages import Kernels
+from potschemas.lean import LeanTiles, lean_at
+from potschemas.messages import ABSENT, Kernels
 from potschemas.wire import encode_array
 
 _FILE_VERSION = 1
@@ -43,6 +45,7 @@ class KernelSet:
     weight_var: Float32  # (K,) log-odds^2
     rule: AnswerRule
     map_revision: int = 0
+    lean: LeanTiles | None = None  # what the kernels' sums are added to: of a map that leans
 
     def __post_init__(self) -> None:
         k = len(self.hinge_mean)
@@ -68,22 +71,27 @@ class KernelSet:
         arrays: dict[str, Any] = {name: getattr(self, name)[index] for name in _ARRAYS}
         return dataclasses.replace(self, **arrays)
 
-    def occupancy(self, points: ArrayLike, *, gradient: bool = False) -> Occupancy:
+    def occupancy(
+        self, points: ArrayLike, *, gradient: bool = False, evidence_only: bool = False
+    ) -> Occupancy:
         """What these kernels say at points, summed in float64, by the server's own formulas (`potschemas.answers`).
 
         Kernels with an activation below 1e-19 are left out. Memory is bounded whatever N and K are.
 
         Args:
             points: (N, 3), or (N, 2) with z = 0; m, the kernels' frame.
-            gradient: Give the analytic gradients of the mean and of the latent mean too; both are 0 where unobserved.
+            gradient: Give the analytic gradients of the mean and of the latent mean too; both are 0 where nothing is known.
+            evidence_only: As for `MapClient.occupancy`.
         Raises:
             UsageError: wrong shape, or coordinates that are not finite.
         """
         queries = as_points(points)
         sums, slopes = self._sums(queries, gradient=gradient)
-        told = answers.answer(sums, self.rule)._asdict()
+        lean = None if self.lean is None else lean_at(queries, self.lean)
+        log_odds = None if lean is None else lean.log_odds
+        told = answers.answer(sums, self.rule, log_odds, evidence_only=evidence_only)._asdict()
         if slopes is not None:
-            of_answer = answers.gradients(sums, slopes, self.rule)
+            of_answer = answers.gradients(sums, slopes, self.rule, lean, evidence_only=evidence_only)
             told |= {"gradient": of_answer.mean, "latent_gradient": of_answer.latent_mean}
         observed = told.pop("observed")
         return Occupancy(
@@ -133,6 +141,7 @@ class KernelSet:
             map_revision=np.int64(self.map_revision),
             **{name: np.float64(value) for name, value in self.rule.fields().items()},
             **{name: getattr(self, name) for name in _ARRAYS},
+            **_lean_arrays(self.lean),
         )
 
     @classmethod
@@ -155,6 +164,7 @@ class KernelSet:
                         **{n: stored[n] for n in RULE_FIELDS if n != "mean_moderation" or n in stored}
                     ),
                     map_revision=int(stored["map_revision"]),
+                    lean=_stored_lean(stored),
                     **{
                         name: stored[name].astype(np.float64 if name == "hinge_mean" else np.float32)
                         for name in _ARRAYS
@@ -168,7 +178,8 @@ class KernelSet:
         origin = np.round(self.hinge_mean.mean(axis=0)) if len(self) else np.zeros(3)
         arrays = {name: getattr(self, name) for name in _ARRAYS} | {"hinge_mean": self.hinge_mean - origin}
         fields: dict[str, Any] = {n: encode_array(array.astype(np.float32)) for n, array in arrays.items()}
-        return Kernels(origin=origin.tolist(), **fields | self.rule.fields())
+        lean = ABSENT if self.lean is None else lean_to_message(self.lean)
+        return Kernels(origin=origin.tolist(), **fields | self.rule.fields(), lean=lean)
 
     @classmethod
     def from_message(cls, message: Kernels, *, map_revision: int = 0) -> KernelSet:
@@ -185,7 +196,8 @@ class KernelSet:
             rule = AnswerRule.of(message)
         except ValueError as error:
             raise BadReplyError(f"kernels: {error}") from error
-        return cls(**arrays, rule=rule, map_revision=map_revision)
+        lean = None if message.lean is ABSENT else lean_from_message(message.lean)[0]
+        return cls(**arrays, rule=rule, map_revision=map_revision, lean=lean)
 
     @staticmethod
     def concatenate(sets: Iterable[KernelSet]) -> KernelSet:
@@ -201,10 +213,31 @@ class KernelSet:
         if len(origins) > 1:
             raise UsageError(f"kernel sets of different maps or revisions: {origins}")
         arrays: dict[str, Any] = {name: np.concatenate([getattr(p, name) for p in parts]) for name in _ARRAYS}
-        return dataclasses.replace(parts[0], **arrays)
+        leans = [p.lean for p in parts if p.lean is not None]
+        nodes = {index: own for lean in leans for index, own in lean.nodes.items()}
+        lean = leans[0]._replace(nodes=nodes) if leans else None
+        return dataclasses.replace(parts[0], **arrays, lean=lean)
 
 
 _ARRAYS = ("hinge_mean", "hinge_var", "gamma_shape", "gamma_rate", "weight_mean", "weight_var")
+
+
+def _lean_arrays(lean: LeanTiles | None) -> dict[str, Any]:
+    if lean is None or not lean.nodes:
+        return {}
+    return {
+        "lean_tile_size_m": np.float64(lean.tile_size_m),
+        "lean_tiles": np.array(list(lean.nodes), np.int64),
+        "lean_nodes": np.stack(list(lean.nodes.values())),
+    }
+
+
+def _stored_lean(stored: Any) -> LeanTiles | None:
+    if "lean_tiles" not in stored:
+        return None
+    index = [(x, y, z) for x, y, z in stored["lean_tiles"].tolist()]
+    nodes = stored["lean_nodes"].astype(np.uint8)
+    return LeanTiles(float(stored["lean_tile_size_m"]), dict(zip(index, nodes, strict=True)))
 
 
 def _shapes(k: int) -> dict[str, tuple[int, ...]]:

@@ -15,10 +15,12 @@ from numpy.typing import ArrayLike, NDArray
 from potclient.arrays import Bool, Float32, Float64
 from potclient.errors import BadReplyError, UsageError
 from potclient.kernels import KernelSet
+from potclient.lean import lean_from_message
 from potclient.occupancy import Occupancy
 from potclient.parts import PartCheck
 from potclient.tile_changes import Kernels, Steps, TileNodes, changed_nodes, kernels_of, steps_of
 from potschemas.answers import RULE_FIELDS, AnswerRule
+from potschemas.lean import LeanTiles
 from potschemas.messages import (
     ABSENT,
     MAX_PART_KERNELS,
@@ -109,8 +111,8 @@ class MapMirror:
 
     @property
     def n_tiles(self) -> int:
-        """Tiles with kernels that are held."""
-        return 0 if self._state is None else len(self._state.tiles)
+        """Tiles that are held."""
+        return 0 if self._state is None else len(self._state.revisions)
 
     @property
     def kernels(self) -> KernelSet:
@@ -124,13 +126,15 @@ class MapMirror:
             raise UsageError("the mirror is empty: call update() first")
         return state.kernels
 
-    def occupancy(self, points: ArrayLike, *, gradient: bool = False) -> Occupancy:
+    def occupancy(
+        self, points: ArrayLike, *, gradient: bool = False, evidence_only: bool = False
+    ) -> Occupancy:
         """What the map of the mirror's revision says at points, without the server; see `KernelSet.occupancy`.
 
         Raises:
             UsageError: nothing was ever mirrored, or the points have a wrong shape.
         """
-        return self.kernels.occupancy(points, gradient=gradient)
+        return self.kernels.occupancy(points, gradient=gradient, evidence_only=evidence_only)
 
 
 _NO_NODES: TileNodes = {}
@@ -148,6 +152,11 @@ class _Tile(NamedTuple):
     steps: Steps | None = None  # None: none did
 
 
+class _LeanTile(NamedTuple):
+    revision: int
+    nodes: NDArray[np.uint8]
+
+
 _ARRAYS = _Tile._fields[1:7]
 
 
@@ -158,19 +167,29 @@ class _State:
     epoch: int
     revision: int
     rule: AnswerRule
+    tile_size_m: float
     tiles: Mapping[TileIndex, _Tile]
+    leans: Mapping[TileIndex, _LeanTile]  # of these tiles, or of others without kernels
+
+    @property
+    def revisions(self) -> dict[TileIndex, int]:
+        """Of all tiles that are held."""
+        held: list[Mapping[TileIndex, Any]] = [self.tiles, self.leans]
+        return {index: tile.revision for tiles in held for index, tile in tiles.items()}
 
     @property
     def known(self) -> Int64:
         """(4, N) index and revision of each tile; in order, so that it deflates well."""
-        columns = [(*index, self.tiles[index].revision) for index in sorted(self.tiles)]
+        columns = [(*index, revision) for index, revision in sorted(self.revisions.items())]
         return np.ascontiguousarray(np.array(columns, np.int64).reshape(-1, 4).T)
 
     @cached_property
     def kernels(self) -> KernelSet:
         tiles = list(self.tiles.values()) or [_NO_TILE]
         arrays: dict[str, Any] = {name: np.concatenate([getattr(t, name) for t in tiles]) for name in _ARRAYS}
-        return KernelSet(**arrays, rule=self.rule, map_revision=self.revision)
+        nodes = {index: tile.nodes for index, tile in self.leans.items()}
+        lean = LeanTiles(self.tile_size_m, nodes) if nodes else None
+        return KernelSet(**arrays, rule=self.rule, map_revision=self.revision, lean=lean)
 
 
 _NONE = np.zeros(0, np.float32)
@@ -209,24 +228,27 @@ class _Reply:
             rule = AnswerRule.of(first)
         except ValueError as error:
             raise BadReplyError(f"tiles: {error}") from error
-        came = self._joined()
-        kept = {} if state is None or first.whole else dict(state.tiles)
-        gone = self._gone(kept)
-        for index in gone:
-            del kept[index]
-        kept.update(came)
-        n_removed = len(gone) if state is None or not first.whole else len(state.tiles.keys() - kept.keys())
+        came, leans_came = self._joined(), self._leans()
+        before = {} if state is None else state.revisions
+        held = {} if first.whole else before
+        gone = self._gone(held)
+        changed = came.keys() | leans_came.keys()
+        stays = held.keys() - set(gone) - changed
+        tiles, leans = ({}, {}) if state is None else (state.tiles, state.leans)
         now = _State(
             epoch=first.epoch,
             revision=first.map_revision,
             rule=rule,
-            tiles=kept,
+            tile_size_m=first.tile_size_m,
+            tiles={index: tile for index, tile in tiles.items() if index in stays} | came,
+            leans={index: lean for index, lean in leans.items() if index in stays} | leans_came,
         )
+        n_removed = len(before.keys() - now.revisions.keys())
         return now, MirrorUpdate(
             revision=first.map_revision,
             epoch=first.epoch,
             is_whole=first.whole,
-            n_tiles=len(came),
+            n_tiles=len(changed),
             n_removed=n_removed,
             n_kernels=sum(len(tile.weight_mean) for tile in came.values()),
             n_bytes=self._n_bytes,
@@ -246,7 +268,21 @@ class _Reply:
                 last = index
         return {index: _joined(*tiles) for index, tiles in pieces.items()}
 
-    def _gone(self, kept: Mapping[TileIndex, _Tile]) -> list[TileIndex]:
+    def _leans(self) -> dict[TileIndex, _LeanTile]:
+        """The leans of all parts."""
+        found: dict[TileIndex, _LeanTile] = {}
+        for part, _ in self._parts.values():
+            if part.lean is ABSENT:
+                continue
+            lean, revisions = lean_from_message(part.lean)
+            if lean.tile_size_m != part.tile_size_m or found.keys() & lean.nodes.keys():
+                raise BadReplyError("tiles: a lean that came twice, or is of tiles of another size")
+            found |= {index: _LeanTile(revisions[index], own) for index, own in lean.nodes.items()}
+        if len({lean.nodes.shape for lean in found.values()}) > 1:
+            raise BadReplyError("tiles: leans with different numbers of nodes")
+        return found
+
+    def _gone(self, kept: Mapping[TileIndex, int]) -> list[TileIndex]:
         gone: list[TileIndex] = []
         for part, _ in self._parts.values():
             if part.gone is None:

@@ -13,7 +13,8 @@ from potclient.files import save_npz
 from potschemas import messages
 from potschemas.messages import DType
 
-_FIELDS = ("mean", "var", "latent_mean", "latent_var", "observed")
+_FIELDS = ("mean", "var", "latent_mean", "latent_var", "observed", "borrowed")
+_ALWAYS = ("mean", "var", "latent_mean", "latent_var")
 _GRADIENTS = ("gradient", "latent_gradient")
 
 
@@ -25,10 +26,11 @@ class Occupancy:
     var: Float32  # (N,) variance of that probability, in [0, 0.25]
     latent_mean: Float32  # (N,) log-odds
     latent_var: Float32  # (N,) log-odds^2
-    observed: Bool  # (N,) false = no kernel near: unknown, which is not free
+    observed: Bool  # (N,) false = nothing was seen near: `mean` is 0.5, or what the map expects there
+    borrowed: Float32  # (N,) in [0, 1]: the share of the answer that is expected and not seen
     # the map revisions that answered, ascending; several only for chunked requests
     revisions: tuple[int, ...] = (0,)
-    gradient: Float32 | None = None  # (N, 3) 1/m, of `mean`; 0 where unobserved; none unless asked for
+    gradient: Float32 | None = None  # (N, 3) 1/m, of `mean`; 0 where nothing is known; none unless asked for
     latent_gradient: Float32 | None = None  # (N, 3) log-odds/m, of `latent_mean`; likewise
 
     def __len__(self) -> int:
@@ -48,12 +50,15 @@ class Occupancy:
         Raises:
             BadReplyError: it does not hold n answers of the promised dtypes, or not the gradients that were asked for.
         """
-        shapes: dict[str, tuple[int, ...]] = dict.fromkeys(_FIELDS[:-1], (n,))
+        shapes: dict[str, tuple[int, ...]] = dict.fromkeys(_ALWAYS, (n,))
         if with_gradient:
             shapes |= dict.fromkeys(_GRADIENTS, (n, 3))
         arrays = arrays_of(message, what, shapes)
         observed = arrays_of(message, what, {"observed": (n,)}, DType.BOOL)
-        return cls(**arrays, **observed, revisions=(message.map_revision,))
+        borrowed = np.zeros(n, np.float32)
+        if message.borrowed is not messages.ABSENT:
+            borrowed = arrays_of(message, what, {"borrowed": (n,)})["borrowed"]
+        return cls(**arrays, **observed, borrowed=borrowed, revisions=(message.map_revision,))
 
     @classmethod
     def empty(cls, *, with_gradient: bool) -> Occupancy:
@@ -68,6 +73,7 @@ class Occupancy:
             latent_mean=none,
             latent_var=none,
             observed=np.zeros(0, np.bool_),
+            borrowed=none,
             **slopes,
         )
 
@@ -92,6 +98,7 @@ class Grid:
     latent_mean: Float32  # (nx, ny, nz) log-odds
     latent_var: Float32  # (nx, ny, nz) log-odds^2
     observed: Bool  # (nx, ny, nz)
+    borrowed: Float32  # (nx, ny, nz)
     revision: int
 
     @property

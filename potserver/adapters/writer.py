@@ -194,6 +194,8 @@ class MapWriter:
         integrate_ms = (time.perf_counter() - started_s) * 1e3
         self._order.remember(scan.robot_id, scan.session, scan.seq)
         self._keeper.advance(self._mapper, self._order.heard)
+        if update.not_leaning is not None:
+            self._health.count(f"not_leaning.{update.not_leaning}")
         self._health.observe("integrate", integrate_ms)
         self._health.observe("clouds.wait", wait_ms)
         self._receipts.accept(job, scan, update, wait_ms=wait_ms, integrate_ms=integrate_ms)

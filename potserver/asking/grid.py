@@ -27,6 +27,7 @@ class Grid:
     lower: ArrayLike  # (3,) m, map frame
     upper: ArrayLike  # (3,) m, map frame; on no axis below `lower`
     resolution: float  # m, edge of a cell
+    evidence_only: bool = False  # nothing is borrowed: what is not observed is unknown
 
     def plan(self, snapshot: KernelMap, limits: Limits, *, part_cells: int = PART_CELLS) -> GridPlan:
         """Check the question.
@@ -48,7 +49,7 @@ class Grid:
                 f"{n_cells:.3g} cells, the limit is {limits.max_grid_cells}; ask for a coarser or smaller grid"
             )
         nx, ny, nz = (int(c) for c in counts)
-        return GridPlan(snapshot, low, float(self.resolution), (nx, ny, nz), part_cells)
+        return GridPlan(snapshot, low, float(self.resolution), (nx, ny, nz), self.evidence_only, part_cells)
 
 
 class GridRun(NamedTuple):
@@ -66,6 +67,7 @@ class GridPlan(Plan[GridRun]):
     lower: Float64  # (3,) m, map frame
     resolution: float  # m
     shape: tuple[int, int, int]  # cells along x, y, z
+    evidence_only: bool
     part_size: int
 
     @property
@@ -77,4 +79,7 @@ class GridPlan(Plan[GridRun]):
         """The answers at the centres of a run of cells."""
         run = self.items(i)
         cells = Cells(self.lower, self.resolution, self.shape)
-        return GridRun(run.start, self.snapshot.occupancy_of_cells(cells, run.start, run.stop))
+        answer = self.snapshot.occupancy_of_cells(
+            cells, run.start, run.stop, evidence_only=self.evidence_only
+        )
+        return GridRun(run.start, answer)

@@ -22,6 +22,7 @@ class Points:
 
     points: ArrayLike  # (N, 3) or (N, 2) m, map frame
     with_gradient: bool = False  # answer the gradients of the mean and of the latent mean too
+    evidence_only: bool = False  # nothing is borrowed: what is not observed is unknown
 
     def plan(self, snapshot: KernelMap, limits: Limits, *, part_points: int = PART_POINTS) -> PointsPlan:
         """Check the question.
@@ -33,7 +34,7 @@ class Points:
         points = checked_points(self.points, limits)
         if len(points) > limits.max_query_points:
             raise TooLargeError(f"{len(points)} points in one query, the limit is {limits.max_query_points}")
-        return PointsPlan(snapshot, points, self.with_gradient, part_size=part_points)
+        return PointsPlan(snapshot, points, self.with_gradient, self.evidence_only, part_size=part_points)
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
@@ -43,6 +44,7 @@ class PointsPlan(Plan[Occupancy]):
     snapshot: KernelMap
     points: Float64  # (N, 3) m, map frame
     with_gradient: bool
+    evidence_only: bool
     part_size: int
 
     @property
@@ -53,9 +55,8 @@ class PointsPlan(Plan[Occupancy]):
     def part(self, i: int) -> Occupancy:
         """The answers at a run of the points, in the order asked."""
         points = self.points[self.items(i)]
-        if self.with_gradient:
-            return self.snapshot.occupancy_with_gradient(points)
-        return self.snapshot.occupancy(points)
+        ask = self.snapshot.occupancy_with_gradient if self.with_gradient else self.snapshot.occupancy
+        return ask(points, evidence_only=self.evidence_only)
 
     def result(self, parts: Iterable[Occupancy]) -> Occupancy:
         """The answer, from all parts in order."""

@@ -159,7 +159,8 @@ class RiskPlan(Plan[CellRisk]):
         if self.dims == 2:
             points[:, 2] = 0.0
         answer = self.snapshot.occupancy(points)
-        p = np.where(answer.observed, answer.mean, _ASSUMED[self.unknown])
+        is_told = answer.observed | (self.unknown is Unknown.PRIOR)
+        p = np.where(is_told, answer.mean, _ASSUMED[self.unknown])
         if self.correlation_m is None:
             typical = self.snapshot.typical_width_m
             width = np.where(answer.observed, self.snapshot.widths(points), typical)

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from potschemas.answers import AnswerRule
+from potschemas.lean import LeanTiles
 from potserver.asking.plan import Plan, checked_box
 from potserver.asking.tile_codes import Steps, TileCodes, TileKey, TileMemory, code_tile
 from potserver.domain.map_state import MapState
@@ -56,7 +57,7 @@ class Tiles:
         tile_size_m: float,
         part_kernels: int = PART_KERNELS,
     ) -> TilesPlan:
-        """Check the question, and compare. A tile without kernels says nothing and counts as none.
+        """Check the question, and compare. A tile without kernels and lean says nothing and counts as none.
 
         Args:
             state: Of the map.
@@ -135,7 +136,15 @@ class TileRun(NamedTuple):
     revisions: Int64  # (T,)
     counts: Int64  # (T,) of `kernels` in each
     kernels: KernelSet  # relative to the lower corners of their tiles; without those in `changes`
+    leans: Leans | None  # none where no tile has one
     changes: tuple[Change, ...] = ()  # of each tile, where the plan has a coding: tiles are whole then
+
+
+class Leans(NamedTuple):
+    """The leans of some tiles that differ, and the revisions of these."""
+
+    told: LeanTiles
+    revisions: tuple[int, ...]
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -148,7 +157,7 @@ class TilesPlan(Plan[TileRun]):
     tile_size_m: float
     spacings_m: tuple[float, ...]  # of the lattices that most of the map's kernels are on
     is_whole: bool  # all tiles of the box, because what the asker has is of another epoch
-    tiles: tuple[tuple[TileIndex, Tile], ...]  # that differ, each with kernels
+    tiles: tuple[tuple[TileIndex, Tile], ...]  # that differ, each with kernels or a lean
     gone: Int64  # (G, 3) tiles that the asker has and the map has not
     coding: Coding | None
     part_size: int
@@ -164,7 +173,8 @@ class TilesPlan(Plan[TileRun]):
         starts = np.cumsum(sizes) - sizes
         run = self.items(i)
         if self.coding is not None:
-            return self._coded(np.flatnonzero((starts >= run.start) & (starts < run.stop)), self.coding)
+            is_here = (sizes > 0) & (starts >= run.start) & (starts < run.stop)
+            return self._coded(i, np.flatnonzero(is_here), self.coding)
         start = np.maximum(run.start - starts, 0)
         counts = np.minimum(run.stop - starts, sizes) - start
         members = np.flatnonzero(counts > 0)
@@ -172,9 +182,9 @@ class TilesPlan(Plan[TileRun]):
             self.tiles[t][1].kernels.kernels.take(slice(int(start[t]), int(start[t] + counts[t])))
             for t in members
         ]
-        return self._run(members, kernels)
+        return self._run(i, members, kernels)
 
-    def _coded(self, members: NDArray[np.intp], coding: Coding) -> TileRun:
+    def _coded(self, i: int, members: NDArray[np.intp], coding: Coding) -> TileRun:
         changes = []
         for t in members:
             index, tile = self.tiles[t]
@@ -184,20 +194,29 @@ class TilesPlan(Plan[TileRun]):
                 codes = code_tile(tile.kernels.kernels, self.spacings_m, self.tile_size_m, coding.steps)
                 coding.memory.put(key, codes)
             changes.append(Change(codes, coding.bases[t]))
-        return self._run(members, [c.codes.others for c in changes])._replace(changes=tuple(changes))
+        return self._run(i, members, [c.codes.others for c in changes])._replace(changes=tuple(changes))
 
-    def _run(self, members: NDArray[np.intp], kernels: list[KernelSet]) -> TileRun:
+    def _run(self, i: int, members: NDArray[np.intp], kernels: list[KernelSet]) -> TileRun:
         return TileRun(
             np.array([self.tiles[t][0] for t in members], np.int64).reshape(-1, 3),
             np.array([self.tiles[t][1].revision for t in members], np.int64),
             np.array([len(k) for k in kernels], np.int64),
             KernelSet.concatenate(kernels),
+            self._leans(i),
         )
+
+    def _leans(self, i: int) -> Leans | None:
+        """Those that travel with a part: each tile's once."""
+        leaning = [(index, tile) for index, tile in self.tiles if tile.lean is not None][i :: self.n_parts]
+        if not leaning:
+            return None
+        nodes = {index: tile.lean for index, tile in leaning if tile.lean is not None}
+        return Leans(LeanTiles(self.tile_size_m, nodes), tuple(tile.revision for _, tile in leaning))
 
 
 def _present(tiles: Mapping[TileIndex, Tile], low: Int64 | None, high: Int64 | None) -> dict[TileIndex, Tile]:
-    """The tiles in a box that have kernels."""
-    everywhere = {index: tile for index, tile in tiles.items() if len(tile.kernels)}
+    """The tiles in a box that have kernels or a lean."""
+    everywhere = {i: tile for i, tile in tiles.items() if len(tile.kernels) or tile.lean is not None}
     inside = _inside(np.array(list(everywhere), np.int64).reshape(-1, 3), low, high)
     return {index: everywhere[index] for index, is_in in zip(everywhere, inside, strict=True) if is_in}
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from potschemas import messages
 from potschemas.answers import AnswerRule
+from potschemas.lean import LeanTiles
 from potschemas.wire import pack_array
 from potserver.asking.lattices import LEAST_ON_LATTICE, distinct_rows, lattice_of, shapes_of
 from potserver.codec.base import float32_fields
@@ -19,11 +20,23 @@ _BYTES_OF_SHAPE = 5 * 4  # hinge_var, gamma_shape, gamma_rate
 _BYTES_OF_LATTICE = 4 * 8
 
 
-def encode_kernels(kernels: KernelSet, rule: AnswerRule) -> messages.Kernels:
+def encode_kernels(kernels: KernelSet, rule: AnswerRule, lean: LeanTiles | None = None) -> messages.Kernels:
     """Kernels as they are: float64 hinges become float32 offsets from their centroid, in whole metres."""
     origin = np.round(kernels.hinge_mean.mean(axis=0)) if len(kernels) else np.zeros(3)
     fields: dict[str, Any] = {**float32_fields(kernels.moved(-origin)), **rule.fields()}
-    return messages.Kernels(origin=origin.tolist(), **fields)
+    told = messages.ABSENT if lean is None else encode_lean(lean)
+    return messages.Kernels(origin=origin.tolist(), **fields, lean=told)
+
+
+def encode_lean(lean: LeanTiles, revisions: Sequence[int] | None = None) -> messages.Lean:
+    """The leans of at least one tile; where revisions do not matter they are 0."""
+    index = np.array(list(lean.nodes), np.int64)
+    revision = np.zeros(len(index), np.int64) if revisions is None else np.array(revisions, np.int64)
+    return messages.Lean(
+        tile_size_m=lean.tile_size_m,
+        tiles=pack_array(np.column_stack([index, revision]).T),
+        nodes=pack_array(np.stack(list(lean.nodes.values()))),
+    )
 
 
 def code_kernels(kernels: KernelSet, spacings_m: Sequence[float]) -> messages.CodedKernels:

@@ -21,6 +21,7 @@ def encode_occupancy(occupancy: Occupancy) -> messages.Occupancy:
         latent_var=float32(occupancy.latent_var),
         observed=wire.encode_array(occupancy.observed),
         map_revision=occupancy.map_revision,
+        borrowed=float32(occupancy.borrowed) if occupancy.borrowed.any() else messages.ABSENT,
         gradient=messages.ABSENT if occupancy.gradient is None else float32(occupancy.gradient),
         latent_gradient=(
             messages.ABSENT if occupancy.latent_gradient is None else float32(occupancy.latent_gradient)

@@ -354,7 +354,7 @@ def _from_kernels(path: Path, settings: Settings) -> MapState:
     service = _service(
         settings.mapping, settings, functools.partial(PotPipeline, method=PAPER._replace(rule=kernels.rule))
     )
-    return state_of_kernels(service, KernelSet.of(kernels))
+    return state_of_kernels(service, KernelSet.of(kernels), kernels.lean)
 
 
 def _service(

@@ -51,10 +51,11 @@ class UnservedMap:
         """Kernels, part by part; those in a box (m, map frame) if there is one."""
         low = np.full(3, -np.inf) if lower is None else np.asarray(lower, np.float64)
         high = np.full(3, np.inf) if upper is None else np.asarray(upper, np.float64)
+        lean = None if self._map.lean is None else self._map.lean.told
         for number, kernels in enumerate(self._parts):
             hinge = kernels.hinge_mean
             inside = np.flatnonzero(((hinge >= low) & (hinge <= high)).all(axis=1))
-            message = encode_kernels(kernels.take(inside), self._map.rule)
+            message = encode_kernels(kernels.take(inside), self._map.rule, lean if number == 0 else None)
             yield (
                 number,
                 len(self._parts),
@@ -65,7 +66,7 @@ class UnservedMap:
         """Occupancy at the cell centres of a box, m, map frame."""
         low, high = np.asarray(lower, np.float64), np.asarray(upper, np.float64)
         nx, ny, nz = (int(n) for n in np.ceil((high - low) / resolution - 1e-6))
-        plan = GridPlan(self._map, low, resolution, (nx, ny, nz), nx * ny * nz)
+        plan = GridPlan(self._map, low, resolution, (nx, ny, nz), False, nx * ny * nz)
         o = plan.part(0).occupancy
 
         def cells(array: NDArray[Any]) -> NDArray[np.float32]:
@@ -79,5 +80,6 @@ class UnservedMap:
             latent_mean=cells(o.latent_mean),
             latent_var=cells(o.latent_var),
             observed=o.observed.reshape(nx, ny, nz),
+            borrowed=cells(o.borrowed),
             revision=self._map.map_revision,
         )

@@ -10,6 +10,7 @@ from pathlib import Path
 from potserver.domain.atom_file import AtomFile, open_atoms, write_atoms
 from potserver.domain.types import Atom
 from potserver.errors import DictionaryError, UnknownAtomError
+from potserver.numerics.heights import HeightModels
 
 
 class AtomDictionary:
@@ -18,17 +19,21 @@ class AtomDictionary:
     Atoms of a file stay in it until they are asked for, so that thousands of them open at once.
     """
 
-    def __init__(self, atoms: Iterable[Atom] = ()) -> None:
+    def __init__(self, atoms: Iterable[Atom] = (), *, heights: HeightModels | None = None) -> None:
         """Hold atoms.
 
+        Args:
+            atoms: In order.
+            heights: What the scans that they were chosen from say of heights above the ground; None: nothing.
         Raises:
             DictionaryError: two atoms have one id.
         """
         self._slots = _by_id(atoms)
+        self.heights = heights
 
     @classmethod
-    def _of(cls, slots: Iterable[Atom | _StoredAtom]) -> AtomDictionary:
-        dictionary = cls()
+    def _of(cls, slots: Iterable[Atom | _StoredAtom], heights: HeightModels | None) -> AtomDictionary:
+        dictionary = cls(heights=heights)
         dictionary._slots = _by_id(slots)
         return dictionary
 
@@ -56,7 +61,7 @@ class AtomDictionary:
 
     def of_dims(self, dims: int) -> AtomDictionary:
         """The atoms learned in 2 or in 3 dimensions."""
-        return AtomDictionary._of(slot for slot in self._slots.values() if slot.dims == dims)
+        return AtomDictionary._of((slot for slot in self._slots.values() if slot.dims == dims), self.heights)
 
     def add(self, atom: Atom) -> AtomDictionary:
         """These atoms and one more, at the end.
@@ -64,7 +69,7 @@ class AtomDictionary:
         Raises:
             DictionaryError: its id is taken.
         """
-        return AtomDictionary._of([*self._slots.values(), atom])
+        return AtomDictionary._of([*self._slots.values(), atom], self.heights)
 
     def remove(self, atom_id: str) -> AtomDictionary:
         """These atoms without one.
@@ -73,7 +78,9 @@ class AtomDictionary:
             UnknownAtomError: there is none of that id.
         """
         leaving = self._slot(atom_id)
-        return AtomDictionary._of(slot for slot in self._slots.values() if slot is not leaving)
+        return AtomDictionary._of(
+            (slot for slot in self._slots.values() if slot is not leaving), self.heights
+        )
 
     @staticmethod
     def builtin() -> AtomDictionary:
@@ -87,7 +94,7 @@ class AtomDictionary:
         Raises:
             DictionaryError: the disk refuses.
         """
-        write_atoms(Path(path), self.atoms)
+        write_atoms(Path(path), self.atoms, self.heights)
 
     @staticmethod
     def load(path: str | os.PathLike[str], *, verify: bool = True) -> AtomDictionary:
@@ -100,7 +107,9 @@ class AtomDictionary:
             DictionaryError: missing, truncated, damaged, or of another format or version; the message says which.
         """
         file = open_atoms(Path(path), verify=verify)
-        return AtomDictionary._of(_StoredAtom(file, number) for number in range(len(file.records)))
+        return AtomDictionary._of(
+            (_StoredAtom(file, number) for number in range(len(file.records))), file.heights
+        )
 
     def _slot(self, atom_id: str) -> Atom | _StoredAtom:
         try:

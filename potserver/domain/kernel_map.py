@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 
 from potschemas import answers
 from potschemas.answers import AnswerRule, LatentGradients, LatentSums
+from potschemas.lean import LeanAt, lean_at
 from potserver.domain.map_part import MapPart
 from potserver.domain.types import Float32, Float64, KernelSet, Occupancy, Unknown
 from potserver.errors import BadPointsError, ShapeError
@@ -20,6 +21,7 @@ from potserver.numerics import gradients, kernel_index, rays
 from potserver.numerics.brick_grid import Cells, grid_sums
 from potserver.numerics.brick_map import BrickMap
 from potserver.numerics.brick_sums import brick_gradients, brick_sums, brick_widths
+from potserver.numerics.lean import Lean
 from potserver.numerics.threads import default_threads, parallel_map, spans
 
 T = TypeVar("T")
@@ -37,6 +39,7 @@ class KernelMap:
         rule: AnswerRule = AnswerRule(),
         map_revision: int = 0,
         threads: int | None = None,
+        lean: Lean | None = None,
     ) -> None:
         """Index the kernels. Answers use the mean of every hinge and every gamma; their dispersions are only kept.
 
@@ -46,8 +49,10 @@ class KernelMap:
             rule: What turns sums over the kernels into answers.
             map_revision: Carried into the answers.
             threads: Threads a query may use; all processors by default.
+            lean: What the kernels' sums are added to; nothing by default.
         """
         self.rule = rule
+        self.lean = lean or None  # an empty one is none
         self.map_revision = map_revision
         self._threads = threads or default_threads()
         if isinstance(kernels, KernelSet):
@@ -114,20 +119,25 @@ class KernelMap:
         """Kernels that stand on no lattice: they are looked for one by one, which takes longer."""
         return len(self) - len(self._bricks)
 
-    def occupancy(self, points: ArrayLike) -> Occupancy:
+    def occupancy(self, points: ArrayLike, *, evidence_only: bool = False) -> Occupancy:
         """Mean and variance of the occupancy probability, and of the latent, anywhere.
 
         Args:
             points: (N, 3) or (N, 2) m, map frame; float64 keeps the precision of far coordinates.
+            evidence_only: Nothing is borrowed: what is not observed is unknown.
         Raises:
             ShapeError: not (N, 3) or (N, 2).
             BadPointsError: NaN or infinite coordinates.
         Source: paper eq. 1; `potschemas.answers`.
         """
-        return self._answer(self.latent(as_points(points)))
+        array = as_points(points)
+        return self._answer(self.latent(array), self._lean_at(array), evidence_only=evidence_only)
 
-    def occupancy_with_gradient(self, points: ArrayLike) -> Occupancy:
-        """`occupancy` and the analytic gradients of its mean and of its latent mean; both are 0 where nothing was observed.
+    def _lean_at(self, points: Float64) -> Float32 | None:
+        return None if self.lean is None else self.lean.at(points, threads=self._threads, lane="query")
+
+    def occupancy_with_gradient(self, points: ArrayLike, *, evidence_only: bool = False) -> Occupancy:
+        """`occupancy` and the analytic gradients of its mean and of its latent mean; both are 0 where nothing is known.
 
         Args, Raises: As `occupancy`.
         """
@@ -137,28 +147,45 @@ class KernelMap:
         if self.n_off_lattice:
             more = gradients.latent_gradients(self._rest, array, threads=self._threads, lane="query")
             slopes = LatentGradients(*(a + b for a, b in zip(slopes, more, strict=True)))
+        lean = None if self.lean is None else lean_at(array, self.lean.told)
         pieces = self._in_pieces(
             lambda cut: answers.gradients(
-                LatentSums(*(s[cut] for s in sums)), LatentGradients(*(s[cut] for s in slopes)), self.rule
+                LatentSums(*(s[cut] for s in sums)),
+                LatentGradients(*(s[cut] for s in slopes)),
+                self.rule,
+                None if lean is None else LeanAt(*(s[cut] for s in lean)),
+                evidence_only=evidence_only,
             ),
             len(array),
         )
         gradient, of_latent = (np.concatenate(columns) for columns in zip(*pieces, strict=True))
-        return dataclasses.replace(self._answer(sums), gradient=gradient, latent_gradient=of_latent)
+        answer = self._answer(sums, None if lean is None else lean.log_odds, evidence_only=evidence_only)
+        return dataclasses.replace(answer, gradient=gradient, latent_gradient=of_latent)
 
-    def occupancy_of_cells(self, cells: Cells, first: int, last: int) -> Occupancy:
+    def occupancy_of_cells(
+        self, cells: Cells, first: int, last: int, *, evidence_only: bool = False
+    ) -> Occupancy:
         """`occupancy` at the centres of a run of a grid's cells, in C order of (x, y, z); `last` is behind it."""
         sums = grid_sums(self._bricks, cells, first, last, threads=self._threads, lane="query")
-        if self.n_off_lattice:
+        lean = None
+        if self.n_off_lattice or self.lean is not None:
             number = np.stack(np.unravel_index(np.arange(first, last), cells.shape), axis=1)
             centres = cells.lower + (number + 0.5) * cells.resolution
-            sums = _added(sums, self._rest_sums(centres))
-        return self._answer(sums)
+            lean = self._lean_at(centres)
+            if self.n_off_lattice:
+                sums = _added(sums, self._rest_sums(centres))
+        return self._answer(sums, lean, evidence_only=evidence_only)
 
-    def _answer(self, sums: LatentSums) -> Occupancy:
-        """What the rule makes of the sums."""
+    def _answer(self, sums: LatentSums, lean: Float32 | None, *, evidence_only: bool) -> Occupancy:
+        """What the rule makes of the sums, and of the lean if there is one."""
         pieces = self._in_pieces(
-            lambda cut: answers.answer(LatentSums(*(s[cut] for s in sums)), self.rule), len(sums.mean)
+            lambda cut: answers.answer(
+                LatentSums(*(s[cut] for s in sums)),
+                self.rule,
+                None if lean is None else lean[cut],
+                evidence_only=evidence_only,
+            ),
+            len(sums.mean),
         )
         answer = answers.Answer(*(np.concatenate(columns) for columns in zip(*pieces, strict=True)))
         return Occupancy(**answer._asdict(), map_revision=self.map_revision)
@@ -186,9 +213,12 @@ class KernelMap:
             Unknown.PRIOR: math.log(2.0) / width_of_unknown,
             Unknown.OCCUPIED: math.inf,
         }
-        options = rays.RayOptions(step_m, quantiles, rate[unknown], width_m)
+        leans = width_of_unknown if unknown is Unknown.PRIOR else None
+        options = rays.RayOptions(step_m, quantiles, rate[unknown], leans, width_m)
         looks = rays.Rays(origins, directions, max_range_m)
-        return rays.first_returns(self._rest, self._bricks, looks, options, self.rule, threads=self._threads)
+        return rays.first_returns(
+            self._rest, self._bricks, looks, options, self.rule, lean=self.lean, threads=self._threads
+        )
 
     @cached_property
     def _rest(self) -> kernel_index.KernelIndex:

@@ -18,9 +18,11 @@ from potserver.domain.map_part import MapPart
 from potserver.domain.order import MAX_ROBOTS
 from potserver.domain.types import Bool, Float32, Float64, KernelSet
 from potserver.errors import MapFullError, OutOfRangeError, SettingsError, ShapeError
+from potserver.numerics.arrays import UInt8
 from potserver.numerics.bricks import Part
 from potserver.numerics.evidence import Cells, Rows, cells, decay, is_alive, tile_of
 from potserver.numerics.grouping import by_number
+from potserver.numerics.lean import Lean
 from potserver.numerics.threads import parallel_map
 from potserver.numerics.voxel_hash import CELL_LIMIT
 
@@ -33,6 +35,8 @@ _PART = (
 )
 FREE = ""  # in the list of robots: a number that belongs to nobody
 _ROW_BYTES, _KERNEL_BYTES = 31, 122  # of a row; of a kernel in its tile and ready to be asked
+_LEAN_M, _LEAN_LEVEL_M = 2.5, 0.25  # between the nodes of a lean, across and upwards, about
+_MOST_LEAN_CELLS = 127  # of a tile along an axis
 _VOXELS_OF_PAIR = 5  # two coarse cells are five fine ones: the least length that every lattice divides
 
 
@@ -102,16 +106,18 @@ class Tile(NamedTuple):
     kernels: MapKernels
     revision: int = 0  # of the map, when the tile was made
     stamp_ns: int = 0  # map time at which the rows weigh what they say
+    lean: UInt8 | None = None  # (X, Y, Z) nodes of `potschemas.lean`; the kernels say what the rows add to it
 
     @property
     def is_empty(self) -> bool:
-        """Nothing was ever seen here, or it is forgotten."""
-        return len(self.rows.kind) == 0 and len(self.kernels) == 0
+        """Nothing was ever seen or expected here, or it is forgotten."""
+        return len(self.rows.kind) == 0 and len(self.kernels) == 0 and self.lean is None
 
     @property
     def n_bytes(self) -> int:
         """About what it takes in memory, with its share of the index."""
-        return _ROW_BYTES * len(self.rows.kind) + _KERNEL_BYTES * len(self.kernels)
+        lean = 0 if self.lean is None else self.lean.nbytes
+        return _ROW_BYTES * len(self.rows.kind) + _KERNEL_BYTES * len(self.kernels) + lean
 
 
 class TileGrid(NamedTuple):
@@ -145,6 +151,14 @@ class TileGrid(NamedTuple):
         """Voxels of free space along a tile's edge; of hits there are twice as many."""
         return round(self.size_m / self.fine_m)
 
+    @property
+    def lean_nodes(self) -> tuple[int, int, int]:
+        """Nodes of a tile's lean along x, y and z, from corner to corner."""
+        across, up = (
+            min(max(round(self.size_m / step), 1), _MOST_LEAN_CELLS) + 1 for step in (_LEAN_M, _LEAN_LEVEL_M)
+        )
+        return across, across, up
+
     def index_of(self, point: Float64) -> TileIndex:
         """The tile that a (3,) point in the map lies in."""
         x, y, z = (int(v) for v in np.floor(point / self.size_m))
@@ -158,6 +172,7 @@ class TiledMap(NamedTuple):
     tiles: Mapping[TileIndex, Tile]
     parts: Mapping[TileIndex, MapPart]  # kernels of some tiles together, ready to be asked
     robots: tuple[str, ...] = ()  # whose the rows are: `Rows.source` numbers them; FREE where nobody's are
+    lean: Lean | None = None  # of all tiles together, ready to be asked; none before any tile is
 
     @staticmethod
     def empty(grid: TileGrid) -> TiledMap:
@@ -203,7 +218,12 @@ class TiledMap(NamedTuple):
                 parts.pop(number, None)
             else:
                 parts[number] = part
-        return self._replace(tiles=tiles, parts=parts)
+        lean = self.lean or Lean(self.grid.size_m, {})
+        return self._replace(
+            tiles=tiles,
+            parts=parts,
+            lean=lean.with_tiles({index: tile.lean for index, tile in changed.items()}),
+        )
 
 
 class MapSize:
@@ -266,6 +286,7 @@ class Region:
     upper: TileIndex  # inclusive
     rows: Rows
     kernels: MapKernels
+    lean: dict[TileIndex, UInt8]  # of those tiles that have one
     cells: Cells | None = None  # of the rows, once known
 
     @staticmethod
@@ -300,6 +321,7 @@ class Region:
         return Region(
             grid=grid, lower=low, upper=high, kernels=kernels.moved(np.asarray(of_kernel * grid.size_m, np.float64)),
             rows=rows._replace(voxel=(rows.voxel + of_row * edge).astype(np.int32)),
+            lean={index: tile.lean for index, tile in zip(found, members, strict=True) if tile.lean is not None},
         )  # fmt: skip
 
     @property
@@ -335,6 +357,7 @@ class Region:
                     kernels.take(kernel_of[slice(*kernel_cuts[number : number + 2])]),
                     revision,
                     stamp_ns,
+                    self.lean.get(index),
                 )
         return out
 
@@ -350,6 +373,28 @@ class Region:
         tile, voxel = tile_of(rows, self.grid.voxels, size)
         order, cuts = by_number(tile, int(size.prod()))
         return rows._replace(voxel=voxel).take(order), cuts
+
+    def unseen_tiles(self, lower_m: Float64, upper_m: Float64) -> list[TileIndex]:
+        """The tiles that a box touches, (3,) m, map frame, and that no evidence is in."""
+        low, high = self.grid.index_of(lower_m), self.grid.index_of(upper_m)
+        size = np.asarray(self.upper, np.int64) - np.asarray(self.lower, np.int64) + 1
+        is_seen = np.zeros(int(size.prod()), bool)
+        is_seen[tile_of(self.rows, self.grid.voxels, size)[0]] = True
+        seen = is_seen.reshape(tuple(size))
+        axes = [
+            range(max(a, x), min(b, y) + 1)
+            for a, b, x, y in zip(low, high, self.lower, self.upper, strict=True)
+        ]
+        x0, y0, z0 = self.lower
+        return [(x, y, z) for x, y, z in itertools.product(*axes) if not seen[x - x0, y - y0, z - z0]]
+
+    def lean_at(self, points: Float64, threads: int) -> Float32 | None:
+        """(N,) log-odds at (N, 3) points of the region, 0 where its tiles do not lean; None if none does."""
+        if not self.lean:
+            return None
+        x0, y0, z0 = self.lower
+        own = {(x - x0, y - y0, z - z0): nodes for (x, y, z), nodes in self.lean.items()}
+        return np.nan_to_num(Lean(self.grid.size_m, own).at(points, threads=threads), copy=False, nan=0.0)
 
 
 def voxels_along(rows: Rows, grid: TileGrid) -> NDArray[np.int64]:

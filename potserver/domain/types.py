@@ -265,8 +265,9 @@ class Occupancy:
     latent_mean: Float32  # (N,) log-odds
     latent_var: Float32  # (N,) log-odds^2
     observed: Bool  # (N,) false = no kernel near: unknown, not free
+    borrowed: Float32  # (N,) in [0, 1]: the share of the answer that is what the dictionary expects, and not evidence
     map_revision: int = 0
-    gradient: Float64 | None = None  # (N, 3) 1/m, of `mean`; 0 where unobserved; none unless asked for
+    gradient: Float64 | None = None  # (N, 3) 1/m, of `mean`; 0 where nothing is known; none unless asked for
     latent_gradient: Float64 | None = None  # (N, 3) log-odds/m, of `latent_mean`; likewise
 
     @staticmethod
@@ -287,7 +288,7 @@ class Unknown(str, Enum):
 
     OCCUPIED = "occupied"  # it stops a ray, and touching it is a collision
     FREE = "free"  # as if nothing were there
-    PRIOR = "prior"  # as the map answers for it: occupied with probability 0.5
+    PRIOR = "prior"  # as the map answers for it: what is expected there, or occupied with probability 0.5
 
 
 class TileChange(NamedTuple):
@@ -313,6 +314,9 @@ class MapUpdate:
     rule: AnswerRule  # what turns `kernels` into answers
     changed: TileChange
     timings_ms: dict[str, float]  # per stage of the pipeline
+    not_leaning: str | None = (
+        None  # why the map leans on nothing about this scan; none: it does, or never would
+    )
 
 
 def yaw_pose(x_m: float, y_m: float, yaw_rad: float, z_m: float = 0.0) -> Float64:

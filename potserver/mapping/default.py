@@ -30,7 +30,17 @@ class DefaultPipeline(Pipeline):
         with clock("label"):
             seen = self.label(scan, draws)
         tiled, source = self.ground(state, seen).with_robot(scan.robot_id)
-        look = Look(seen.labelled, seen.beams.learned, scan.origin, source, scan.is_planar, draws.surface)
+        with clock("expect"):
+            expected = self.expect(seen, carrier)
+        look = Look(
+            seen.labelled,
+            seen.beams.learned,
+            scan.origin,
+            source,
+            scan.is_planar,
+            draws.surface,
+            expected.place,
+        )
         own, fused = self.learn(tiled, look, seen, moment, carrier, clock)
         with clock("index"):
             tiled, fused = self.age(tiled.with_tiles(fused.tiles, threads=self.threads), fused, moment)
@@ -38,7 +48,7 @@ class DefaultPipeline(Pipeline):
         with clock("check"):
             scores = self.check(snapshot, seen, state.scores, draws)
         after = MapState(snapshot=snapshot, tiled=tiled, stamp_ns=moment.stamp_ns, scores=scores)
-        return integrated(state, after, seen, own, fused, clock.timings_ms)
+        return integrated(state, after, seen, own, fused, clock.timings_ms, expected.reason)
 
     @property
     def own_threads(self) -> int:

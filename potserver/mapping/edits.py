@@ -153,8 +153,11 @@ def remove_robot(
         for dy in (-1, 0, 1)
         for dz in (-1, 0, 1)
     }
-    left = tiled.without_robot(source)._replace(tiles={**tiled.tiles, **without})
-    return _settle(left, around & left.tiles.keys(), options, moment, threads)
+    # what was expected about its scans goes too, where nobody else has seen anything
+    tiles = {**tiled.tiles, **without}
+    bare = {i: t._replace(lean=None) for i, t in tiles.items() if t.lean is not None and not len(t.rows.kind)}
+    left = tiled.without_robot(source)._replace(tiles=tiles | bare)
+    return _settle(left, (around | bare.keys()) & left.tiles.keys(), options, moment, threads)
 
 
 def _settle(

@@ -27,6 +27,7 @@ from potserver.domain.tiles import (
 )
 from potserver.domain.types import Bool, Float32, Float64, KernelSet
 from potserver.errors import SolverError
+from potserver.mapping.leaning import Expected, lean_of_tiles
 from potserver.mapping.placing import activation, gamma_of_spacing, kernels_at
 from potserver.mapping.refinement import FEATURE_CUT
 from potserver.mapping.settings import MappingSettings
@@ -97,6 +98,7 @@ class Look(NamedTuple):
     source: int  # the robot's number in the map
     is_planar: bool  # kernels stay in the plane of the points
     rng: np.random.Generator  # of the samples next to faces
+    expected: Expected | None = None  # what tiles that are seen for the first time lean on
 
 
 class Moment(NamedTuple):
@@ -164,6 +166,9 @@ def fuse(
     lower, upper = lower - pad, upper + pad
     region = Region.of(tiled, lower - 4 * pad, upper + 4 * pad, moment.weight_of)
     inside = lower - region.origin_m, upper - region.origin_m  # of tiles that are stored again
+    if look.expected is not None:
+        unseen = region.unseen_tiles(lower, upper)
+        region.lean |= lean_of_tiles(look.expected, unseen, grid)
     samples = _samples_of(look, region, options, threads)
     new_rows = add_evidence(region, samples, look.source, within=inside, turn=moment.revision)
     taken = KernelSet.empty()
@@ -420,9 +425,13 @@ def _fit(region: Region, lower: Float64, upper: Float64, options: FusionOptions,
     per_step = blocks.n_values * (2 + 2 * effort.gradient_steps)
     cheap = _CHEAP_VALUES // max(per_step, 1)
     n_newton = int(np.clip(cheap, effort.newton_steps, effort.most_newton_steps))
+    prior = Prior(
+        region.kernels.prior_mean[local],
+        region.kernels.prior_var[local],
+        region.lean_at(where[rows], threads),
+    )
     fit = warm_fit(
-        blocks, evidence.LABELS[region.rows.kind[rows]], counts,
-        Prior(region.kernels.prior_mean[local], region.kernels.prior_var[local]), kernels.weight_mean[local],
+        blocks, evidence.LABELS[region.rows.kind[rows]], counts, prior, kernels.weight_mean[local],
         Solver(n_newton, effort.gradient_steps, _LONGEST_STEP), free=free, threads=threads,
     )  # fmt: skip
     if not (np.isfinite(fit.weights).all() and np.isfinite(fit.var).all()):

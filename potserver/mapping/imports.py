@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 
+from potschemas.lean import LeanTiles
 from potserver.domain.kernel_map import KernelMap
 from potserver.domain.map_state import MapState
-from potserver.domain.tiles import Region, TiledMap, TileGrid
+from potserver.domain.tiles import CARRIED, MapKernels, Region, Tile, TiledMap, TileGrid
 from potserver.domain.types import Bool, Float32, Float64, KernelSet
-from potserver.errors import BadPointsError, EmptyError
+from potserver.errors import BadPointsError, EmptyError, SettingsError
 from potserver.mapping.fusion import Moment, add_evidence, append
 from potserver.mapping.service import MappingService
 from potserver.mapping.surfaces import Samples
+from potserver.numerics.evidence import Rows
 
 
 def state_of_places(
@@ -53,20 +55,30 @@ def state_of_places(
     return service.state
 
 
-def state_of_kernels(service: MappingService, kernels: KernelSet) -> MapState:
+def state_of_kernels(service: MappingService, kernels: KernelSet, lean: LeanTiles | None = None) -> MapState:
     """The map that answers by these kernels, as they are; it has no evidence, so that only profile `paper` goes on from it.
 
     Args:
         service: An empty one, whose settings count; it makes the map.
         kernels: Map frame.
+        lean: What their sums are added to.
     Raises:
         EmptyError: no kernels.
+        SettingsError: the lean is of tiles of another size.
     """
     if len(kernels) == 0:
         raise EmptyError("there are no kernels in it: no map can be made")
     settings = service.settings
     tiled = TiledMap.empty(TileGrid.of(settings.tile_size_m, settings.resolution_m or 0.2))
     tiles = append(tiled, kernels, Moment(1, 0))
+    if lean is not None:
+        if lean.tile_size_m != settings.tile_size_m:
+            raise SettingsError(
+                f"the kernels lean on tiles of {lean.tile_size_m} m, mapping.tile_size_m is {settings.tile_size_m}:"
+                " set it to theirs"
+            )
+        bare = Tile(Rows.empty(), MapKernels.new(KernelSet.empty(), CARRIED), revision=1)
+        tiles |= {index: tiles.get(index, bare)._replace(lean=nodes) for index, nodes in lean.nodes.items()}
     tiled = tiled.with_tiles(tiles)
     empty = KernelMap(KernelSet.empty(), map_revision=1)
     service.restore(MapState(snapshot=empty, tiled=tiled))

@@ -19,6 +19,7 @@ from potserver.domain.types import KernelSet, MapUpdate, Scan, Sector, SectorMat
 from potserver.mapping.carrying import Carried, Carrier
 from potserver.mapping.checking import check
 from potserver.mapping.fusion import SCAN_EFFORT, FitEffort, Fused, FusionOptions, Moment, grid_for
+from potserver.mapping.leaning import Expectation, expect
 from potserver.mapping.matching import Ranking
 from potserver.mapping.sampling import BeamLimits, DrawnBeams, Draws, draw_beams, thin_beams
 from potserver.mapping.sectors import SectorCut, cut_sectors
@@ -118,7 +119,8 @@ class Pipeline(ABC):
         if self.method.is_calibrated:
             rule = dataclasses.replace(rule, mean_moderation=scores.moderation(rule.mean_moderation))
         parts = list(tiled.parts.values()) if tiled is not None else []
-        return KernelMap(parts, rule=rule, map_revision=revision, threads=self.threads)
+        lean = None if tiled is None else tiled.lean
+        return KernelMap(parts, rule=rule, map_revision=revision, threads=self.threads, lean=lean)
 
     # --- the steps of a scan ---------------------------------------------------------------------------------------------
 
@@ -149,6 +151,16 @@ class Pipeline(ABC):
             grid_for(seen.beams.learned, self.settings.tile_size_m, self.settings.resolution_m)
         )
 
+    def expect(self, seen: LabelledScan, carrier: Carrier) -> Expectation:
+        """What the dictionary expects around a scan."""
+        return expect(
+            carrier.dictionary.heights,
+            seen.beams.learned,
+            seen.labelled,
+            seen.scan.origin,
+            planar=seen.scan.is_planar,
+        )
+
     def carry(self, seen: LabelledScan, carrier: Carrier, clock: Stopwatch) -> Carried:
         """Carry an atom to each sector."""
         with clock("match"):
@@ -170,6 +182,7 @@ def integrated(
     own: ScanMap,
     fused: Fused,
     timings_ms: dict[str, float],
+    not_leaning: str | None = None,
 ) -> Integrated:
     """The new state with the report for the sender.
 
@@ -180,6 +193,7 @@ def integrated(
         own: Its instantaneous map.
         fused: What changed in the overall map.
         timings_ms: By step.
+        not_leaning: Why the map does not lean about this scan; None: it does, or the pipeline never does.
     """
     assert after.tiled is not None, "a scan makes a map"
     update = MapUpdate(
@@ -195,5 +209,6 @@ def integrated(
         rule=dataclasses.replace(after.snapshot.rule, observed_activation=OBSERVED_ACTIVATION),
         changed=TileChange(after.tiled.grid.size_m, sorted(fused.tiles)),
         timings_ms=timings_ms,
+        not_leaning=not_leaning,
     )
     return Integrated(dataclasses.replace(after, epoch=before.epoch, n_scans=before.n_scans + 1), update)

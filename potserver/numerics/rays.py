@@ -21,13 +21,14 @@ from typing import NamedTuple
 import numba as nb
 import numpy as np
 
-from potschemas.answers import AnswerRule
+from potschemas.answers import ROOM, ROOM_IN_SOLID, AnswerRule
 from potserver.numerics.arrays import Float64, Int64
 from potserver.numerics.brick_map import BrickMap, BrickTable
 from potserver.numerics.brick_sums import room_for_a_thread, sums_at
 from potserver.numerics.fastexp import exp32, inner_loop
 from potserver.numerics.gathering import kernels_that_reach
 from potserver.numerics.kernel_index import KernelIndex
+from potserver.numerics.lean import Lean, LeanTable, lean_of
 from potserver.numerics.threads import parallel_map, spans
 
 _END_OF_RAY = 1e-7  # survival below which a ray ends: the share by which a moment or a probability may be off
@@ -52,6 +53,8 @@ class RayOptions(NamedTuple):
     step_m: float  # longest step
     quantiles: Float64  # (Q,) ascending, in (0, 1), of the range
     unknown_rate: float  # hazard of unobserved space, 1/m; infinite: it stops a ray at once
+    # m, over which what is expected of unobserved space counts as one trial, where anything is; None: it does not count
+    unknown_width_m: float | None
     width_m: float | None  # what counts as one trial, m; None: the kernels' own
 
 
@@ -116,6 +119,7 @@ def first_returns(
     options: RayOptions,
     rule: AnswerRule,
     *,
+    lean: Lean | None = None,
     threads: int = 1,
 ) -> FirstReturns:
     """March rays by the midpoint rule, whose error falls with the square of the step.
@@ -128,6 +132,7 @@ def first_returns(
         rays: Where to look.
         options: How.
         rule: How sums over kernels become an occupancy.
+        lean: What the sums are added to.
         threads: Threads to spread the rays over.
     """
     # copies: the march is compiled for writable arrays, and arrays that were received are read-only
@@ -142,10 +147,12 @@ def first_returns(
         bricks=bricks.table,
         thresholds=-np.log1p(-np.asarray(options.quantiles, np.float64)),
         unknown_rate=float(options.unknown_rate),
+        unknown_width_m=-1.0 if options.unknown_width_m is None else float(options.unknown_width_m),
         fixed_width_m=-1.0 if options.width_m is None else float(options.width_m),
         observed_activation=float(rule.observed_activation),
         residual_var=float(rule.residual_var),
         mean_moderation=float(rule.mean_moderation),
+        lean=(lean or Lean(1.0, {})).table,
     )
 
     def run(span: tuple[int, int]) -> None:
@@ -161,17 +168,19 @@ class _March(NamedTuple):
     bricks: BrickTable
     thresholds: Float64  # (Q,) hazard integrals at which the quantiles lie
     unknown_rate: float  # 1/m
+    unknown_width_m: float  # negative: what is expected of unobserved space does not count
     fixed_width_m: float  # negative: the kernels' own
     observed_activation: float
     residual_var: float  # log-odds^2
     mean_moderation: float
+    lean: LeanTable
 
 
 @nb.njit(error_model="numpy", cache=True)
 def moderated(
     mean: float, var: float, activation: float, residual_var: float, mean_moderation: float
 ) -> float:
-    """z of the occupancy sigmoid(z) that sums at an observed point give: `potschemas.answers`, compiled for one point."""
+    """z of the occupancy sigmoid(z) of sums at an observed point, without a lean: `potschemas.answers`, for one point."""
     s2 = var + residual_var * max(1.0 - activation, 0.0)
     return mean / math.sqrt(1.0 + mean_moderation * math.pi / 8.0 * s2)
 
@@ -282,14 +291,26 @@ def _march(first, last, rays, n_steps, block, march, index, widths, room, out, q
                     activation + more[2],
                     weighted + more[3],
                 )
+            lean = lean_of(
+                march.lean,
+                origins[i, 0] + (r + 0.5 * h) * directions[i, 0],
+                origins[i, 1] + (r + 0.5 * h) * directions[i, 1],
+                origins[i, 2] + (r + 0.5 * h) * directions[i, 2],
+            )
             if activation > 0.0 and activation >= march.observed_activation:
                 is_known = True
                 width = march.fixed_width_m if march.fixed_width_m > 0 else weighted / activation
                 z = moderated(mean, var, activation, march.residual_var, march.mean_moderation)
+                if not math.isnan(lean):
+                    solid = min(max(lean, 0.0), 1.0) if mean < 0.0 else 0.0
+                    full = ROOM + (ROOM_IN_SOLID - ROOM) * solid
+                    z = lean + min((activation - march.observed_activation) / full, 1.0) * z
                 rate = _softplus(z) / width
             else:
                 is_known = False
                 rate = march.unknown_rate
+                if march.unknown_width_m > 0 and not math.isnan(lean):
+                    rate = _softplus(lean) / march.unknown_width_m
                 if math.isnan(unknown_range):
                     unknown_range = r
             if rate == np.inf:

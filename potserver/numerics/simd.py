@@ -72,7 +72,8 @@ def _named(typing: Callable[..., Any], name: str) -> Any:
 load8 = _load(_float32x8, _VECTOR, 4, "load8")
 load_f32 = _load(types.float32, _F32, 4, "load_f32")
 load_f64 = _load(types.float64, ir.DoubleType(), 8, "load_f64")
-load_i16 = _load(types.int64, ir.IntType(16), 2, "load_i16")  # this and the next two as an int64
+load_i8 = _load(types.int64, ir.IntType(8), 1, "load_i8")  # this and the next three as an int64
+load_i16 = _load(types.int64, ir.IntType(16), 2, "load_i16")
 load_i32 = _load(types.int64, _I32, 4, "load_i32")
 load_i64 = _load(types.int64, ir.IntType(64), 8, "load_i64")
 store8 = _store(_float32x8, _VECTOR, 4, "store8")

@@ -1,6 +1,6 @@
 """Weights of a map that is fitted again after every scan: a few Newton steps from where they are.
 
-    minimise  sum_n c_n (log(1 + exp(f_n)) - y_n f_n) + 1/2 sum_m (w_m - prior_mean_m)^2 / prior_var_m,    f = Phi w
+    minimise  sum_n c_n (log(1 + exp(f_n)) - y_n f_n) + 1/2 sum_m (w_m - prior_mean_m)^2 / prior_var_m,    f = offset + Phi w
 
 The work is bounded, and the last weights are near the optimum but for where the world has changed. Plain Newton gets stuck
 there: a row that is surely wrong has no curvature left, steps overshoot and every line search fails. Two things help. Rows on
@@ -36,10 +36,13 @@ _LOG1P = tuple(
 
 
 class Prior(NamedTuple):
-    """Independent normal distributions of K weights."""
+    """Independent normal distributions of K weights, and what N rows are expected to say."""
 
     mean: Float32  # (K,) log-odds
     var: Float32  # (K,) log-odds^2, > 0
+    offset: Float32 | None = (
+        None  # (N,) log-odds, in the order of the labels: what f is without any kernel; None: 0
+    )
 
 
 class Solver(NamedTuple):
@@ -98,6 +101,8 @@ def warm_fit(
     mask = np.ones(len(start), np.float32) if free is None else free.astype(np.float32)
     w = start.astype(np.float32)
     f = product(blocks, w, threads=threads)
+    if prior.offset is not None:
+        f = f + prior.offset[blocks.order]
 
     def objective(change: Float32, step: Float32, size: float) -> float:
         off = (w + np.float32(size) * step - prior.mean).astype(np.float64)

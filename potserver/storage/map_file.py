@@ -102,7 +102,8 @@ class SavedMap(NamedTuple):
     def kernel_map(self) -> KernelMap:
         """The map that answers as the saved one did."""
         parts = [] if self.tiled is None else list(self.tiled.parts.values())
-        return KernelMap(parts, rule=self.record.answer_rule, map_revision=self.record.revision)
+        lean = None if self.tiled is None else self.tiled.lean
+        return KernelMap(parts, rule=self.record.answer_rule, map_revision=self.record.revision, lean=lean)
 
     def state(self, *, epoch: int | None = None, revision: int | None = None) -> MapState:
         """What `MappingService.restore` takes; it puts together the kernels that queries are answered from.

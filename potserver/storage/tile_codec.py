@@ -1,8 +1,9 @@
 """A tile as bytes on the disk: bit for bit what it was, and compact.
 
 head     what the tile is: its index, revision, stamp, and how many rows and kernels follow
-body     the arrays, column by column, each number's bytes apart (all first bytes, then all second ones), deflated: what is
-         alike in a column, such as the widths of a lattice's kernels or their places on it, then takes next to nothing
+body     the arrays, column by column, each number's bytes apart (all first bytes, then all second ones), and then the lean's
+         numbers of nodes and its nodes, if the tile has one; deflated: what is alike in a column, such as the widths of a
+         lattice's kernels or their places on it, then takes next to nothing
 seal     of head and body
 """
 
@@ -22,6 +23,8 @@ from potserver.numerics.evidence import KINDS, Rows
 from potserver.storage.seal import sealed, unsealed
 
 _HEAD = struct.Struct("<3i2q2I")  # index, revision, stamp_ns, rows, kernels
+_LEAN = struct.Struct("<3B")  # nodes along x, y, z
+_MOST_LEAN_BYTES = 2**21 + _LEAN.size  # more than any tile's
 _LEVEL = 1  # of deflate: the higher ones cost ten times as much for a few per cent
 
 
@@ -57,6 +60,8 @@ def encode_tile(index: TileIndex, tile: Tile) -> bytes:
         *(_planes(getattr(kernels.kernels, c.name), c) for c in _KERNELS),
         *(_planes(getattr(kernels, c.name), c) for c in _MAP_KERNELS),
     ]
+    if tile.lean is not None:
+        columns.append(_LEAN.pack(*tile.lean.shape) + tile.lean.tobytes())
     head = _HEAD.pack(*index, tile.revision, tile.stamp_ns, len(rows.kind), len(kernels))
     body = zlib.compress(b"".join(columns), _LEVEL)
     return sealed(head + body)
@@ -81,8 +86,9 @@ def decode_tile(data: bytes, grid: TileGrid, n_robots: int) -> tuple[TileIndex, 
     try:
         inflate = zlib.decompressobj()
         # one byte more would show that there is more
-        plain = inflate.decompress(content[_HEAD.size :], n_bytes + 1)
-        if len(plain) != n_bytes or not inflate.eof:
+        plain = inflate.decompress(content[_HEAD.size :], n_bytes + _MOST_LEAN_BYTES + 1)
+        lean = _lean_of(plain[n_bytes:])
+        if len(plain) < n_bytes or not inflate.eof or (lean is None and len(plain) != n_bytes):
             raise MapFileError(f"tile {(x, y, z)} is not of the size that it says", reason="damaged")
         arrays, start = {}, 0
         for column, n in sizes:
@@ -100,6 +106,7 @@ def decode_tile(data: bytes, grid: TileGrid, n_robots: int) -> tuple[TileIndex, 
             ),
             revision,
             stamp_ns,
+            lean,
         )
     except (zlib.error, ShapeError) as error:
         raise MapFileError(f"tile {(x, y, z)}: {error}", reason="damaged") from error
@@ -119,9 +126,21 @@ def _check(tile: Tile, grid: TileGrid, n_robots: int, index: TileIndex) -> None:
         and ((kernels.level >= 0) & (kernels.level <= CARRIED)).all()
         and np.isfinite(kernels.prior_mean).all()
         and (np.isfinite(kernels.prior_var) & (kernels.prior_var > 0)).all()
+        and (tile.lean is None or tile.lean.shape == grid.lean_nodes)
     )
     if not sound:
         raise MapFileError(f"tile {index} has rows or kernels that no map makes", reason="damaged")
+
+
+def _lean_of(data: bytes) -> NDArray[np.uint8] | None:
+    """The nodes in what follows a tile's columns; None where nothing does, or no lean."""
+    if len(data) < _LEAN.size:
+        return None
+    shape = _LEAN.unpack_from(data)
+    if min(shape) < 2 or len(data) != _LEAN.size + shape[0] * shape[1] * shape[2]:
+        return None
+    nodes: NDArray[np.uint8] = np.frombuffer(data, np.uint8, offset=_LEAN.size).reshape(shape).copy()
+    return nodes
 
 
 def _planes(array: NDArray[Any], column: _Column) -> bytes:

@@ -16,11 +16,24 @@ An `AnswerRule` makes the answer from them. With c = mean_moderation:
     mean = sigmoid(k mu)
     var = mean (1 - mean) (1 - 1 / sqrt(1 + pi s2 / 8))
 
-The gradients with respect to x are 0 where unobserved, and elsewhere
+A map that leans (`potschemas.lean`) has a lean g at x, beside kernels that say what the data add to it. What evidence counts
+there grows with what is known, e = clip((a - observed_activation) / room, 0, 1). Free space ends where beams end, but kernels
+go on: where they call free (f < 0) what is expected to be solid (g > 0), more must be known,
+
+    room = ROOM + (ROOM_IN_SOLID - ROOM) clip(g, 0, 1) where f < 0, else ROOM
+
+    mu = e f + g / k      mean = sigmoid(k mu) = sigmoid(k e f + g)      borrowed = 1 - e
+
+Asked for evidence only, it is e = 1 where observed (mu = f + g / k), and as above elsewhere: unknown. `observed` and s2 go by
+evidence whatever the map leans on.
+
+The gradients of a map without a lean are 0 where unobserved, and elsewhere
 
     grad mu = grad f
     grad s2 = grad v - residual_var grad a, without the second term where a >= 1
     grad mean = mean (1 - mean) (k grad mu - c pi / 16 k^3 mu grad s2)
+
+Those of a map with one follow from the same formulas; see `gradients`.
 
 Sources: mean, the moderated sigmoid of MacKay, "The evidence framework applied to classification networks", Neural Computation
 4, 1992; var, Daunizeau, "Semi-analytical approximations to statistical moments of sigmoid and softmax mappings of normal
@@ -37,6 +50,8 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from potschemas.lean import LeanAt
+
 Bool = NDArray[np.bool_]
 Float = NDArray[np.floating]
 Float64 = NDArray[np.float64]
@@ -46,6 +61,9 @@ _Real = TypeVar("_Real", bound=np.floating)
 OBSERVED_ACTIVATION = 0.05
 # Variance of the latent where nothing is known, log-odds^2: a standard deviation of 10, anything from sure to sure.
 PRIOR_VAR = 100.0
+# By how much the known activation must be above what makes a point observed, for its evidence to count in full. A full lattice
+# sums to 3.4.
+ROOM, ROOM_IN_SOLID = 0.2, 2.0
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -120,6 +138,7 @@ class Answer(NamedTuple):
     latent_mean: Float  # (N,) log-odds, dtype of the sums
     latent_var: Float  # (N,) log-odds^2, dtype of the sums
     observed: Bool  # (N,) false: no kernel near; unknown, not free
+    borrowed: Float  # (N,) in [0, 1], dtype of the sums: the share of the answer that is the lean's and not the evidence's
 
 
 class AnswerGradients(NamedTuple):
@@ -135,27 +154,83 @@ def known(weight_var: Float, rule: AnswerRule) -> Float:
     return share
 
 
-def answer(sums: LatentSums, rule: AnswerRule) -> Answer:
-    """Occupancy at N points. Probabilities are float64: a sure one in float32 rounds to 1, an infinite log-loss if wrong."""
-    observed = sums.activation >= rule.observed_activation
-    latent_mean = np.where(observed, sums.mean, 0.0)
-    unexplained = np.maximum(1.0 - sums.activation, 0.0)
-    latent_var = np.where(observed, sums.var + rule.residual_var * unexplained, rule.prior_var)
-    mean = occupancy_mean(latent_mean, latent_var, rule.mean_moderation)
-    return Answer(mean, occupancy_var(mean, latent_var), latent_mean, latent_var, observed)
+def answer(
+    sums: LatentSums, rule: AnswerRule, lean: Float | None = None, *, evidence_only: bool = False
+) -> Answer:
+    """Occupancy at N points. Probabilities are float64: a sure one in float32 rounds to 1, an infinite log-loss if wrong.
+
+    Args:
+        sums: Over the kernels.
+        rule: Of the map.
+        lean: (N,) log-odds, NaN where there is none; None: the map does not lean.
+        evidence_only: What is not observed is unknown, whatever the map leans on there.
+    """
+    observed, latent_var = _observed(sums, rule)
+    if lean is None:
+        latent = np.where(observed, sums.mean, 0.0)
+        borrowed = np.zeros_like(sums.mean)
+    else:
+        share, _, _, own = _weighed(sums, rule, lean, evidence_only=evidence_only)
+        latent = share * sums.mean + own * _spread(latent_var, rule.mean_moderation)
+        borrowed = np.where(np.isnan(lean) | evidence_only, 0.0, 1.0 - share).astype(sums.mean.dtype)
+    mean = occupancy_mean(latent, latent_var, rule.mean_moderation)
+    var = occupancy_var(mean, latent_var)
+    return Answer(mean, var, latent.astype(sums.mean.dtype), latent_var, observed, borrowed)
 
 
-def gradients(sums: LatentSums, slopes: LatentGradients, rule: AnswerRule) -> AnswerGradients:
-    """Gradients of `answer`'s mean and latent mean, from those of the sums."""
-    mean, _, latent_mean, latent_var, observed = answer(sums, rule)
+def gradients(
+    sums: LatentSums,
+    slopes: LatentGradients,
+    rule: AnswerRule,
+    lean: LeanAt | None = None,
+    *,
+    evidence_only: bool = False,
+) -> AnswerGradients:
+    """Gradients of `answer`'s mean and latent mean, from those of the sums and of the lean."""
+    observed, latent_var = _observed(sums, rule)
+    if lean is None:
+        share, own = observed.astype(np.float64), np.zeros(len(observed))
+        by_activation = by_lean = own
+        own_slope = np.zeros((len(observed), 3))
+    else:
+        share, by_activation, by_lean, own = _weighed(sums, rule, lean.log_odds, evidence_only=evidence_only)
+        own_slope = np.where((observed | (not evidence_only))[:, None], lean.gradient, 0.0)
     # the residual variance has a slope below an activation of 1 only
     residual = np.where(sums.activation < 1.0, rule.residual_var, 0.0)
-    var_slope = slopes.var - residual[:, None] * slopes.activation
+    var_slope = np.where(observed[:, None], slopes.var - residual[:, None] * slopes.activation, 0.0)
     k = 1.0 / _spread(latent_var, rule.mean_moderation)
-    by_var = (rule.mean_moderation * math.pi / 16.0) * (latent_mean * k**3)
-    slope = (mean * (1.0 - mean))[:, None] * (k[:, None] * slopes.mean - by_var[:, None] * var_slope)
-    known = observed[:, None]
-    return AnswerGradients(np.where(known, slope, 0.0), np.where(known, slopes.mean, 0.0).astype(np.float64))
+    k_slope = (-rule.mean_moderation * math.pi / 16.0 * k**3)[:, None] * var_slope
+    share_slope = by_activation[:, None] * slopes.activation + by_lean[:, None] * own_slope
+    by_data = share[:, None] * slopes.mean + sums.mean[:, None] * share_slope
+    weighed = (share * sums.mean)[:, None]
+    z_slope = k[:, None] * by_data + weighed * k_slope + own_slope
+    mean = occupancy_mean(share * sums.mean + own / k, latent_var, rule.mean_moderation)
+    latent_slope = by_data + own_slope / k[:, None] - (own / k**2)[:, None] * k_slope
+    return AnswerGradients((mean * (1.0 - mean))[:, None] * z_slope, latent_slope.astype(np.float64))
+
+
+def _observed(sums: LatentSums, rule: AnswerRule) -> tuple[Bool, Float]:
+    """What evidence decides alone: (N,) which points are observed, and (N,) the latent variance."""
+    observed = sums.activation >= rule.observed_activation
+    unexplained = np.maximum(1.0 - sums.activation, 0.0)
+    return observed, np.where(observed, sums.var + rule.residual_var * unexplained, rule.prior_var)
+
+
+def _weighed(
+    sums: LatentSums, rule: AnswerRule, lean: Float, *, evidence_only: bool
+) -> tuple[Float64, Float64, Float64, Float64]:
+    """What evidence counts, (N,) in [0, 1]; its slopes by the activation and by the lean; and (N,) the lean that counts."""
+    observed = sums.activation >= rule.observed_activation
+    is_whole = np.isnan(lean) | evidence_only  # nothing is borrowed: what is observed counts in full
+    own = np.where(np.isnan(lean) | (evidence_only & ~observed), 0.0, lean).astype(np.float64)
+    more, frees = ROOM_IN_SOLID - ROOM, sums.mean < 0
+    room = ROOM + more * np.where(frees, np.clip(own, 0.0, 1.0), 0.0)
+    above = sums.activation.astype(np.float64) - rule.observed_activation
+    grown = np.clip(above / room, 0.0, 1.0)
+    share = np.where(is_whole, observed.astype(np.float64), grown)
+    is_growing = ~is_whole & (grown > 0.0) & (grown < 1.0)
+    by_lean = np.where(is_growing & frees & (own > 0.0) & (own < 1.0), -more * grown / room, 0.0)
+    return share, np.where(is_growing, 1.0 / room, 0.0), by_lean, own
 
 
 def occupancy_mean(latent_mean: Float, latent_var: Float, mean_moderation: float = 1.0) -> Float64:

@@ -46,6 +46,7 @@ def examples() -> dict[str, m.Message]:
     add(kernels)
     add(no_kernels, "empty")
     add(_kernels(1, origin=[500_000.0, 5_400_000.0, 250.5]), "far_origin")
+    add(msgspec.structs.replace(no_kernels, lean=_lean()), "lean")
 
     served = m.SectorReport(
         azimuth_min_rad=-0.5,
@@ -166,6 +167,7 @@ def examples() -> dict[str, m.Message]:
     add(m.PointsQuery(points=_f4([[1.0, 2.0, 0.5], [-3.0, 0.25, 0.5]]), deadline_ms=250.0))
     add(m.PointsQuery(points=_f8([[500_000.25, 5_400_000.5]])), "planar_float64")
     add(m.PointsQuery(points=_f4([[1.0, 2.0, 0.5]]), with_gradient=True), "gradient")
+    add(m.PointsQuery(points=_f4([[1.0, 2.0, 0.5]]), evidence_only=True), "evidence_only")
     occupancy = m.Occupancy(
         mean=_f4([0.875, 0.5]),
         var=_f4([0.015625, 0.25]),
@@ -191,11 +193,27 @@ def examples() -> dict[str, m.Message]:
     )
     add(
         m.Occupancy(
+            mean=_f4([0.875, 0.125]),
+            var=_f4([0.015625, 0.0625]),
+            latent_mean=_f4([2.5, -3.0]),
+            latent_var=_f4([0.75, 64.0]),
+            observed=_bool([True, False]),
+            map_revision=31,
+            borrowed=_f4([0.25, 1.0]),
+        ),
+        "borrowed",
+    )
+    add(
+        m.Occupancy(
             mean=none, var=none, latent_mean=none, latent_var=none, observed=_bool([]), map_revision=0
         ),
         "no_points",
     )
     add(m.GridQuery(lower=[-1.0, -1.0, 0.0], upper=[1.0, 1.0, 0.5], resolution=0.25, deadline_ms=1000.0))
+    add(
+        m.GridQuery(lower=[0.0, 0.0, 0.0], upper=[1.0, 1.0, 0.5], resolution=0.25, evidence_only=True),
+        "evidence_only",
+    )
     add(m.GridQuery(lower=[-1.0, -1.0, 0.0], upper=[1.0, 1.0, 0.5], resolution=0.25), "minimal")
     add(
         m.GridPart(
@@ -285,6 +303,7 @@ def examples() -> dict[str, m.Message]:
     add(m.TilesQuery(), "whole_map")
     add(_tiles_part())
     add(_tiles_part(deflated=True), "deflated")
+    add(msgspec.structs.replace(_tiles_part(), lean=_lean()), "lean")
     add(
         msgspec.structs.replace(
             _tiles_part(),
@@ -505,6 +524,17 @@ def _tiles_part(*, deflated: bool = False) -> m.TilesPart:
         prior_var=64.0,
         residual_var=32.0,
         mean_moderation=0.0625,
+    )
+
+
+def _lean() -> m.Lean:
+    """A tile whose lower half is likely occupied."""
+    nodes = np.full((1, 2, 2, 3), 64, np.uint8)
+    nodes[..., 0] = 176
+    return m.Lean(
+        tile_size_m=8.0,
+        tiles=_packed(np.array([[0], [-1], [0], [31]], np.int64)),
+        nodes=_packed(nodes),
     )
 
 

@@ -120,6 +120,14 @@ class Pose(Message, frozen=True, kw_only=True):
 # --- kernels --------------------------------------------------------------------------------------
 
 
+class Lean(msgspec.Struct, frozen=True, kw_only=True):
+    """What a map expects in some of its tiles, in log-odds, to which the sums over its kernels are added: `potschemas.lean`."""
+
+    tile_size_m: Positive  # m, edge of a tile; its lower corner is index * tile_size_m
+    tiles: Packed  # (4, L) int64: index x, y, z and revision of each tile
+    nodes: Packed  # (L, X, Y, Z) uint8: (byte - 128) / 16 log-odds, on nodes from corner to corner; trilinear between them
+
+
 class Kernels(Message, frozen=True, kw_only=True):
     """K kernels in the map frame, ten numbers each, and the rule that turns them into answers: its last four fields.
 
@@ -140,6 +148,7 @@ class Kernels(Message, frozen=True, kw_only=True):
     prior_var: Finite  # log-odds^2, of the latent where nothing was observed
     residual_var: Finite  # log-odds^2, added in the measure that this sum falls short of 1
     mean_moderation: Finite = 1.0  # share of the latent variance that pulls the mean towards 0.5
+    lean: Lean | Absent = ABSENT  # of a map that leans: its latent is this and the sum over the kernels
 
 
 class SectorReport(msgspec.Struct, frozen=True, kw_only=True):
@@ -230,6 +239,7 @@ class PointsQuery(Message, frozen=True, kw_only=True):
     points: Array  # (N, 3) or (N, 2) float32 or float64, m, map frame
     deadline_ms: Positive | None = None  # ms from arrival; past it no work and no part begins
     with_gradient: bool | Absent = ABSENT  # true: the answer brings both gradients
+    evidence_only: bool | Absent = ABSENT  # true: nothing is borrowed, what is not observed is unknown
 
 
 class Occupancy(Message, frozen=True, kw_only=True):
@@ -241,9 +251,10 @@ class Occupancy(Message, frozen=True, kw_only=True):
     var: Array  # (N,) float32, variance of that probability, in [0, 0.25]
     latent_mean: Array  # (N,) float32, log-odds
     latent_var: Array  # (N,) float32, log-odds^2
-    observed: Array  # (N,) bool; false = no kernel near: unknown, which is not free
+    observed: Array  # (N,) bool; false = nothing was seen near: `mean` is 0.5, or what is expected there
     map_revision: Count  # all answers are of this one
-    gradient: Array | Absent = ABSENT  # (N, 3) float32, 1/m, of `mean`; 0 where unobserved
+    borrowed: Array | Absent = ABSENT  # (N,) float32, share that is expected, not seen; absent = 0
+    gradient: Array | Absent = ABSENT  # (N, 3) float32, 1/m, of `mean`; 0 where nothing is known
     latent_gradient: Array | Absent = ABSENT  # (N, 3) float32, log-odds/m, of `latent_mean`; likewise
 
 
@@ -256,6 +267,7 @@ class GridQuery(Message, frozen=True, kw_only=True):
     upper: Vector3  # m, map frame; above `lower` on every axis
     resolution: Positive  # m, cell edge
     deadline_ms: Positive | None = None  # ms from arrival; past it no work and no part begins
+    evidence_only: bool | Absent = ABSENT  # true: nothing is borrowed, what is not observed is unknown
 
 
 class GridPart(Message, frozen=True, kw_only=True):
@@ -277,7 +289,7 @@ class Unknown(str, Enum):
 
     OCCUPIED = "occupied"  # it stops a ray; touching it is a collision
     FREE = "free"  # as if nothing were there
-    PRIOR = "prior"  # as the map answers for it: occupied with probability 0.5
+    PRIOR = "prior"  # as the map answers for it: what is expected there, or occupied with probability 0.5
 
 
 class RaysQuery(Message, frozen=True, kw_only=True):
@@ -434,7 +446,7 @@ class TilesPart(Message, frozen=True, kw_only=True):
     map_revision: Count  # the same in all parts
     whole: bool  # the epoch is not the asker's: these are all tiles of the box, what it had is void
     tile_size_m: Positive  # m, edge of a tile; its lower corner is index * tile_size_m
-    tiles: Packed  # (4, T) int64: index x, y, z and revision of each tile that differs
+    tiles: Packed  # (4, T) int64: index x, y, z and revision of each tile with kernels that differs
     counts: Packed  # (T,) int64, how many of `kernels` are of each tile; at least 1 without `changes`
     gone: Packed | None = None  # (3, G) int64, indices of tiles known to the asker and not there; in part 0
     kernels: CodedKernels  # of the tiles one after the other, but for those in `changes`
@@ -443,6 +455,7 @@ class TilesPart(Message, frozen=True, kw_only=True):
     residual_var: Finite  # log-odds^2, added in the measure that this sum falls short of 1
     mean_moderation: Finite  # share of the latent variance that pulls the mean towards 0.5
     changes: TileChanges | Absent = ABSENT  # where the query has a step
+    lean: Lean | Absent = ABSENT  # of a map that leans: of some tiles that differ, each once in the reply
 
 
 class AtomInfo(msgspec.Struct, frozen=True, kw_only=True):

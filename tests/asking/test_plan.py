@@ -14,6 +14,7 @@ from potserver.asking.plan import Plan
 from potserver.asking.points import Points, PointsPlan
 from potserver.asking.rays import Rays
 from potserver.asking.risk import Risk
+from potserver.asking.tile_codes import TileMemory
 from potserver.asking.tiles import Tiles
 from potserver.domain.dictionary import AtomDictionary
 from potserver.errors import OutOfRangeError
@@ -70,7 +71,7 @@ def test_all_parts_come_from_one_map_whatever_becomes_of_it() -> None:
         Rays([[1.0, 1, 1]] * 4, [[1.0, 0, 0]] * 4, 3.0).plan(snapshot, limits, part_samples=1),
         Risk(np.eye(4)[None], [[4.0, 4, 4, 1.0]]).plan(snapshot, limits, part_cells=10),
         Params().plan(snapshot, limits, part_kernels=50),
-        Tiles().plan(mapping.state, limits, tile_size_m=8.0, part_kernels=50),
+        Tiles().plan(mapping.state, limits, TileMemory(), tile_size_m=8.0, part_kernels=50),
     ]
     before = [numbers_in(list(plan.parts())) for plan in plans]
     mapping.state = LATER
@@ -89,7 +90,7 @@ def plan_all_at(x_m: float) -> list[Any]:
         lambda: Rays([corner], [[1.0, 0, 0]], 1.0).plan(STATE.snapshot, limits),
         lambda: Risk(pose[None], [[0.0, 0, 0, 1.0]]).plan(STATE.snapshot, limits),
         lambda: Params(corner).plan(STATE.snapshot, limits),
-        lambda: Tiles(lower=corner).plan(STATE, limits, tile_size_m=8.0),
+        lambda: Tiles(lower=corner).plan(STATE, limits, TileMemory(), tile_size_m=8.0),
     ]
 
 

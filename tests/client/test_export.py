@@ -62,7 +62,7 @@ class HeldMap:
         low = np.asarray(lower, np.float64)
         shape = tuple(np.ceil((np.asarray(upper) - low) / resolution - 1e-6).astype(int))
         answer = self.kernels.occupancy(low + (np.argwhere(np.ones(shape)) + 0.5) * resolution)
-        names = ("mean", "var", "latent_mean", "latent_var", "observed")
+        names = ("mean", "var", "latent_mean", "latent_var", "observed", "borrowed")
         cells = {name: getattr(answer, name).reshape(shape) for name in names}
         return Grid(lower=low, resolution=resolution, revision=7, **cells)
 

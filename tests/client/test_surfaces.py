@@ -63,7 +63,13 @@ class Place:
         blind = (np.linalg.norm(p[:, :2] - _SENSOR, axis=1) < _BLIND_M) & (p[:, 2] < ground_m(p[:, 0]) + 0.3)
         observed = (depth < 0.5) & ~blind
         mean[~observed] = 0.5
-        as_cells = {"mean": mean, "var": mean * (1 - mean), "latent_mean": depth, "latent_var": depth * 0 + 1}
+        as_cells = {
+            "mean": mean,
+            "var": mean * (1 - mean),
+            "latent_mean": depth,
+            "latent_var": depth * 0 + 1,
+            "borrowed": depth * 0,
+        }
         cells = {name: array.reshape(shape).astype(np.float32) for name, array in as_cells.items()}
         return Grid(lower=low, resolution=resolution, revision=7, observed=observed.reshape(shape), **cells)
 

@@ -28,7 +28,7 @@ def grid(mean: Any, observed: Any) -> Grid:
     p = np.asarray(mean, np.float32)
     return Grid(
         lower=np.zeros(3), resolution=0.5, revision=1, mean=p, var=p * (1 - p), latent_mean=p, latent_var=p,
-        observed=np.asarray(observed, np.bool_),
+        observed=np.asarray(observed, np.bool_), borrowed=0 * p,
     )  # fmt: skip
 
 

@@ -23,6 +23,7 @@ def test_no_answer_is_rounded_up_to_certainty() -> None:
         latent_mean=np.zeros(n, np.float32),
         latent_var=np.zeros(n, np.float32),
         observed=np.array([True, False, True]),
+        borrowed=np.zeros(n, np.float32),
         map_revision=4,
     )
     message = encode(encode_occupancy(occupancy))

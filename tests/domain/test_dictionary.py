@@ -19,6 +19,7 @@ from potserver.domain import atom_file
 from potserver.domain.dictionary import AtomDictionary
 from potserver.domain.types import Atom, KernelSet
 from potserver.errors import DictionaryError, UnknownAtomError
+from potserver.numerics.heights import HeightModels
 
 _KERNEL_ARRAYS = [f.name for f in dataclasses.fields(KernelSet)]
 
@@ -104,6 +105,23 @@ def test_a_change_gives_another_dictionary(atoms: AtomDictionary, path: Path, st
 def test_the_file_holds_everything(atoms: AtomDictionary, path: Path) -> None:
     for before, after in zip(atoms, AtomDictionary.load(path), strict=True):
         assert_equal(before, after)
+
+
+def test_height_models_are_kept_through_files_and_changes(atoms: AtomDictionary, tmp_path: Path) -> None:
+    model = HeightModels(
+        np.array([-1.0, 0.0, 2.5]), np.array([0.0, 9.0]), np.arange(12.0).reshape(2, 3, 2) / 7
+    )
+    changed = AtomDictionary(atoms, heights=model).remove(atoms.atoms[0].atom_id).of_dims(3)
+    changed.save(tmp_path / "a.atoms")
+    again = AtomDictionary.load(tmp_path / "a.atoms").heights
+    assert again is not None
+    for one, other in zip(again, model, strict=True):
+        np.testing.assert_array_equal(one, other)
+    assert atoms.heights is None
+    broken = AtomDictionary(atoms, heights=model._replace(heights_m=np.array([1.0, 0.0, 2.0])))
+    broken.save(tmp_path / "b.atoms")
+    with pytest.raises(DictionaryError, match="height models"):
+        AtomDictionary.load(tmp_path / "b.atoms")
 
 
 def test_no_atoms_are_a_file_too(tmp_path: Path) -> None:

@@ -225,6 +225,7 @@ def pose_message(stamp_ns: int, x_m: float) -> messages.Pose:
 
 class FakeSnapshot:
     rule = AnswerRule(observed_activation=0.05, prior_var=50.0, residual_var=50.0)
+    lean = None
 
     def __init__(self, owner: FakeMapper, kernels: KernelSet, map_revision: int) -> None:
         self._owner, self.kernels, self.map_revision = owner, kernels, map_revision
@@ -232,7 +233,7 @@ class FakeSnapshot:
     def __len__(self) -> int:
         return len(self.kernels)
 
-    def occupancy(self, points: Any) -> Occupancy:
+    def occupancy(self, points: Any, **_: Any) -> Occupancy:
         self._owner.queries.pass_through()
         n = len(points)
         return Occupancy(
@@ -241,10 +242,11 @@ class FakeSnapshot:
             latent_mean=np.zeros(n, np.float32),
             latent_var=np.full(n, 50.0, np.float32),
             observed=np.zeros(n, bool),
+            borrowed=np.zeros(n, np.float32),
             map_revision=self.map_revision,
         )
 
-    def occupancy_of_cells(self, _cells: Any, first: int, last: int) -> Occupancy:
+    def occupancy_of_cells(self, _cells: Any, first: int, last: int, **_: Any) -> Occupancy:
         return self.occupancy(np.zeros((last - first, 3)))
 
 

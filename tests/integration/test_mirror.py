@@ -58,10 +58,10 @@ class Site:
         self.client.integrate(points, pose, stamp_ns=self._n * 1_000_000_000)
 
     def tiles(self) -> dict[tuple[int, int, int], int]:
-        """The revision of each tile with kernels, as the server has it."""
+        """The revision of each tile, as the server has it."""
         mapper: Any = self.server.mapper("default")
         tiled = mapper.state.tiled
-        return {} if tiled is None else {i: t.revision for i, t in tiled.tiles.items() if len(t.kernels)}
+        return {} if tiled is None else {i: t.revision for i, t in tiled.tiles.items()}
 
 
 @pytest.fixture
@@ -106,6 +106,44 @@ def test_updates_carry_the_tiles_that_changed_and_no_others(site: Site) -> None:
     order, same = (np.lexsort(kernels.hinge_mean.round(4).T) for kernels in (whole, mirror.kernels))
     for name in ("gamma_shape", "gamma_rate", "hinge_var", "weight_mean", "weight_var"):
         np.testing.assert_array_equal(getattr(whole, name)[order], getattr(mirror.kernels, name)[same])
+
+
+def test_a_map_that_leans_is_mirrored_with_its_lean(site: Site) -> None:
+    rng = np.random.default_rng(4)
+    ground = np.column_stack([rng.uniform(-9, 9, (500, 2)), np.full(500, -1.6)]).astype(np.float32)
+    mirror = site.client.mirror()
+    for n, x in enumerate((0.0, 40.0)):
+        pose = np.eye(4)
+        pose[0, 3] = x
+        site.client.integrate(ground, pose, stamp_ns=(n + 1) * 10**9)
+        mirror.update()
+        points = rng.uniform([x - 9, -9, -2], [x + 9, 9, 3], (500, 3))
+        assert_says_what_the_server_says(mirror, site.client, points)
+        there = site.client.occupancy(points, with_gradient=True)
+        here = mirror.occupancy(points, gradient=True)
+        assert (there.borrowed > 0.5).mean() > 0.1
+        assert np.abs(there.mean - 0.5)[~there.observed].max() > 0.02
+        alike = np.abs(there.borrowed - here.borrowed) < 1e-3
+        assert alike.mean() > 0.98
+        np.testing.assert_allclose(here.gradient[alike], there.gradient[alike], atol=2e-3)
+        own = site.client.occupancy(points, evidence_only=True)
+        assert not own.borrowed.any()
+        assert (own.mean[~own.observed] == 0.5).all()
+        np.testing.assert_allclose(mirror.occupancy(points, evidence_only=True).mean, own.mean, atol=0.02)
+    assert mirror.update().is_empty
+    assert "not_leaning.no_ground" not in site.client.stats().counters
+    wall = np.column_stack([np.full(500, 6.0), rng.uniform(-6, 6, 500), rng.uniform(1, 5, 500)])
+    site.client.integrate(wall.astype(np.float32), pose, stamp_ns=3 * 10**9)
+    assert site.client.stats().counters["not_leaning.no_ground"] == 1
+    mirror.update()
+    whole = site.client.params()
+    np.testing.assert_allclose(whole.occupancy(points).mean, mirror.occupancy(points).mean, atol=1e-5)
+    cells = site.client.grid([30, -4, -2], [34, 4, 0], 0.5)
+    asked = site.client.occupancy(cells.centers().reshape(-1, 3))
+    np.testing.assert_allclose(cells.mean.ravel(), asked.mean, atol=1e-5)
+    np.testing.assert_allclose(cells.borrowed.ravel(), asked.borrowed, atol=1e-4)
+    bare = site.client.grid([30, -4, -2], [34, 4, 0], 0.5, evidence_only=True)
+    assert not bare.borrowed.any()
 
 
 def test_a_box_is_mirrored_so_that_answers_in_it_are_the_map_s(site: Site) -> None:

@@ -234,7 +234,7 @@ def test_points_do_not_wait_behind_grids(make_rig: MakeRig) -> None:
     rig = make_rig(queries__threads=1)
     client = rig.client()
     free = rig.mapper.snapshot.occupancy
-    rig.mapper.snapshot.occupancy = lambda points: free(points) if len(points) > 1 else _answer_of(rig)
+    rig.mapper.snapshot.occupancy = lambda points, **_: free(points) if len(points) > 1 else _answer_of(rig)
     rig.mapper.queries.hold()
     grids = [in_background(lambda: client.ask("grid", _grid_of_parts())) for _ in range(3)]
     rig.mapper.queries.wait_entered()

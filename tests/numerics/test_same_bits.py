@@ -73,7 +73,9 @@ def test_rays() -> None:
     directions = np.random.default_rng(1).normal(size=(50, 3))
     directions /= np.linalg.norm(directions, axis=1)[:, None]
     rays = Rays(points[:50], directions, np.full(50, 6.0))
-    options = RayOptions(step_m=0.1, quantiles=np.array([0.1, 0.5]), unknown_rate=0.3, width_m=None)
+    options = RayOptions(
+        step_m=0.1, quantiles=np.array([0.1, 0.5]), unknown_rate=0.3, unknown_width_m=None, width_m=None
+    )
     rule = AnswerRule(0.05, 100.0, 1.0, 0.5)
     _same(
         [

@@ -23,6 +23,7 @@ import pytest
         "service",
         "sessions",
         "standing",
+        "thin",
         "torture",
     ],
 )

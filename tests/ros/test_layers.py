@@ -46,6 +46,7 @@ class FormulaMap:
             latent_mean=latent,
             latent_var=np.ones_like(mean),
             observed=inside,
+            borrowed=np.zeros_like(mean),
         )
 
     def grid(self, lower: Any, upper: Any, resolution: float) -> Grid:
@@ -58,7 +59,10 @@ class FormulaMap:
             lower=np.asarray(lower, np.float64),
             resolution=resolution,
             revision=1,
-            **{f: getattr(answer, f) for f in ("mean", "var", "latent_mean", "latent_var", "observed")},
+            **{
+                f: getattr(answer, f)
+                for f in ("mean", "var", "latent_mean", "latent_var", "observed", "borrowed")
+            },
         )
 
 

@@ -17,6 +17,8 @@ import pytest
 
 from potschemas import messages
 from potschemas.answers import (
+    ROOM,
+    ROOM_IN_SOLID,
     RULE_FIELDS,
     AnswerRule,
     LatentGradients,
@@ -28,6 +30,7 @@ from potschemas.answers import (
     sigmoid,
 )
 from potschemas.examples import examples
+from potschemas.lean import LeanAt
 from potserver.mapping.pipeline import DEFAULT_RULE
 from potserver.numerics import rays
 
@@ -120,7 +123,7 @@ def test_an_answer_is_the_rule_point_by_point(rule: AnswerRule) -> None:
         mu, s2 = (f, v + rule.residual_var * max(0.0, 1.0 - a)) if known else (0.0, rule.prior_var)
         mean = 1 / (1 + math.exp(-mu / math.sqrt(1 + rule.mean_moderation * math.pi * s2 / 8)))
         var = mean * (1 - mean) * (1 - 1 / math.sqrt(1 + math.pi * s2 / 8))
-        np.testing.assert_allclose([column[i] for column in got], [mean, var, mu, s2, known], rtol=1e-12)
+        np.testing.assert_allclose([column[i] for column in got], [mean, var, mu, s2, known, 0], rtol=1e-12)
 
 
 def test_float32_sums_keep_float32_latents_and_get_float64_probabilities() -> None:
@@ -129,6 +132,32 @@ def test_float32_sums_keep_float32_latents_and_get_float64_probabilities() -> No
     assert got.latent_mean.dtype == got.latent_var.dtype == np.float32
     assert got.mean.dtype == got.var.dtype == np.float64
     assert {type(value) for value in rule.fields().values()} == {float}
+
+
+def test_a_lean_answers_where_nothing_was_seen_and_yields_where_all_was() -> None:
+    rule = DEFAULT_RULE
+    sums = LatentSums(np.full(4, -5.0), np.full(4, 9.0), np.array([0.0, 1.0, 2.4, 3.4]))
+    lean = np.full(4, 2.0)
+    got, own = answer(sums, rule, lean), answer(sums, rule, lean, evidence_only=True)
+    np.testing.assert_allclose(got.borrowed, [1.0, 1.0, 0.5, 0.0], atol=1e-12)
+    np.testing.assert_allclose(got.mean[:2], sigmoid(lean)[:2])
+    k = 1 / np.sqrt(1 + rule.mean_moderation * math.pi / 8 * 9.0)
+    np.testing.assert_allclose(got.mean[2:], sigmoid(np.array([2.0 - 0.5 * k * 5.0, 2.0 - k * 5.0])))
+    np.testing.assert_allclose(own.mean, [0.5, 0.5, got.mean[3], got.mean[3]])
+    # what is not expected to be solid is free as soon as it is seen to be
+    assert not answer(sums, rule, -lean).borrowed[2:].any()
+    assert not own.borrowed.any()
+    for other in (own, answer(sums, rule)):
+        np.testing.assert_array_equal(got.observed, other.observed)
+        np.testing.assert_array_equal(got.latent_var, other.latent_var)
+
+
+@pytest.mark.parametrize("evidence_only", [False, True])
+def test_where_there_is_no_lean_an_answer_is_that_of_a_map_without_one(evidence_only: bool) -> None:
+    sums = sums_of(300, 6)
+    got = answer(sums, DEFAULT_RULE, np.full(300, np.nan), evidence_only=evidence_only)
+    for one, other in zip(got, answer(sums, DEFAULT_RULE), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-12)
 
 
 @pytest.mark.parametrize("rule", RULES)
@@ -173,8 +202,11 @@ def formulas(root: Path) -> CodeType:
     return compile("\n".join(blocks), "schemas/README.md", "exec")
 
 
+@pytest.mark.parametrize("leans", ["", "leans", "evidence only"])
 @pytest.mark.parametrize("rule", RULES)
-def test_the_formulas_of_the_contract_are_the_answers(formulas: CodeType, rule: AnswerRule) -> None:
+def test_the_formulas_of_the_contract_are_the_answers(
+    formulas: CodeType, rule: AnswerRule, leans: str
+) -> None:
     rng, k, n = np.random.default_rng(5), 60, 250
     kernels = {
         "origin": np.array([400.0, -300.0, 2.0]),
@@ -185,9 +217,13 @@ def test_the_formulas_of_the_contract_are_the_answers(formulas: CodeType, rule: 
         "weight_var": rng.uniform(0.1, 9, k),
     }
     points = kernels["origin"] + rng.uniform(-4, 4, (n, 3))
+    tilt = rng.normal(size=3)  # of a lean that is linear
+    evidence_only = leans == "evidence only"
 
     def told(x: Array) -> SimpleNamespace:
-        names = {**kernels, **rule.fields(), "x": x}
+        lean = (x - kernels["origin"]) @ tilt if leans else None
+        names = {**kernels, **rule.fields(), "x": x, "lean": lean, "lean_gradient": tilt}
+        names["evidence_only"] = evidence_only
         exec(formulas, names)
         return SimpleNamespace(**names)
 
@@ -201,8 +237,19 @@ def test_the_formulas_of_the_contract_are_the_answers(formulas: CodeType, rule: 
         np.einsum("nk,nkd->nd", 2 * v * a, grad_a),
         np.einsum("k,nkd->nd", known, grad_a),
     )
-    got, of_got = answer(sums, rule), gradients(sums, slopes, rule)
-    near_edge = np.abs(sums.activation[:, None] - [rule.observed_activation, 1.0]).min(axis=1) < 1e-4
+    lean = None
+    if leans:
+        log_odds = (points - kernels["origin"]) @ tilt
+        lean = LeanAt(log_odds, np.broadcast_to(tilt, (n, 3)))
+    got = answer(sums, rule, None if lean is None else lean.log_odds, evidence_only=evidence_only)
+    of_got = gradients(sums, slopes, rule, lean, evidence_only=evidence_only)
+    edges = [np.full(n, rule.observed_activation), np.ones(n)]
+    if lean is not None:
+        solid = np.where(sums.mean < 0, np.clip(lean.log_odds, 0, 1), 0)
+        edges.append(rule.observed_activation + ROOM + (ROOM_IN_SOLID - ROOM) * solid)
+    near_edge = np.abs(sums.activation - edges).min(axis=0) < 1e-4
+    if lean is not None:  # kinks
+        near_edge |= np.abs(np.stack([lean.log_odds, lean.log_odds - 1, sums.mean])).min(axis=0) < 1e-4
     if rule.observed_activation > 0:
         assert (~got.observed).sum() > 5
     if rule.observed_activation < 1:

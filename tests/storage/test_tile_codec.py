@@ -47,6 +47,7 @@ def make_tile(n_rows: int, n_kernels: int, seed: int = 0, n_robots: int = 3) -> 
         ),
         revision=int(rng.integers(0, 2**62)),
         stamp_ns=int(rng.integers(0, 2**62)),
+        lean=rng.integers(0, 256, GRID.lean_nodes).astype(np.uint8) if seed % 2 else None,
     )
 
 
@@ -54,7 +55,8 @@ def arrays_of(tile: Tile) -> list[np.ndarray[Any, Any]]:
     """Every array of a tile."""
     kernels = tile.kernels
     inner = [getattr(kernels.kernels, f.name) for f in dataclasses.fields(KernelSet)]
-    return [*tile.rows, *inner, kernels.level, kernels.prior_mean, kernels.prior_var]
+    lean = [] if tile.lean is None else [tile.lean]
+    return [*tile.rows, *inner, kernels.level, kernels.prior_mean, kernels.prior_var, *lean]
 
 
 def assert_same(a: Tile, b: Tile) -> None:
@@ -117,6 +119,7 @@ def test_a_sound_checksum_does_not_make_a_sound_tile() -> None:
         _with(tile, sums=np.full((4, 4), np.nan, np.float32)),
         _with(tile, source=np.full(4, 3, np.int16)),
         _with(tile, kind=np.full(4, 4, np.uint8)),
+        tile._replace(lean=np.zeros((2, 2, 2), np.uint8)),
         tile._replace(kernels=dataclasses.replace(tile.kernels, level=np.full(3, 9, np.int8))),
         tile._replace(kernels=dataclasses.replace(tile.kernels, prior_var=np.zeros(3, np.float32))),
     ]

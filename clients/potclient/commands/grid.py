@@ -38,6 +38,9 @@ def add(commands: Any) -> None:
     add_box_arguments(parser, "corner of the box, m, map frame")
     parser.add_argument("--resolution", type=positive, required=True, metavar="METRES", help="cell edge")
     parser.add_argument(
+        "--evidence-only", action="store_true", help="borrow nothing from what the dictionary expects"
+    )
+    parser.add_argument(
         "-o",
         "--out",
         type=output_file,
@@ -65,7 +68,13 @@ def run(arguments: argparse.Namespace) -> int:
             lower = low if lower is None else np.asarray(lower)
             upper = np.maximum(high, lower + arguments.resolution) if upper is None else upper
         with part_bar() as progress:
-            grid = client.grid(lower, upper, arguments.resolution, progress=progress)
+            grid = client.grid(
+                lower,
+                upper,
+                arguments.resolution,
+                evidence_only=arguments.evidence_only,
+                progress=progress,
+            )
     say(
         f"{' x '.join(str(n) for n in grid.shape)} cells of {grid.resolution:g} m, revision {grid.revision}: "
         f"{float(grid.observed.mean()):.1%} observed, {int(((grid.mean > 0.5) & grid.observed).sum())} occupied"

@@ -34,7 +34,7 @@ def add(commands: Any) -> None:
         run,
         help="occupancy and its uncertainty at points",
         description="""Ask how likely points are occupied. Each answer has the probability, its standard deviation, the latent
-log-odds with theirs, and whether the map has seen anything near: unknown is 0.5 and not the same as free.""",
+log-odds with theirs, whether the map has seen anything near, and which share of it is borrowed: expected, not seen.""",
         epilog="""examples:
   potclient query 1 2 0.5
   potclient query 1 2 0.5 -3 0 1           two points
@@ -47,6 +47,9 @@ log-odds with theirs, and whether the map has seen anything near: unknown is 0.5
         "--file", type=Path, metavar="FILE", help=".npy of shape (N, 3) or (N, 2), or text rows of x y z"
     )
     parser.add_argument("--gradient", action="store_true", help="gradients of probability and log-odds too")
+    parser.add_argument(
+        "--evidence-only", action="store_true", help="borrow nothing from what the dictionary expects"
+    )
     parser.add_argument("-o", "--out", type=output_file, metavar="FILE", help="write all answers to an .npz")
     add_json_argument(parser)
 
@@ -54,8 +57,10 @@ log-odds with theirs, and whether the map has seen anything near: unknown is 0.5
 def run(arguments: argparse.Namespace) -> int:
     points = _query_points(arguments)
     with client_of(arguments) as client:
-        answer = client.occupancy(points, with_gradient=arguments.gradient)
-    names = ["mean", "var", "latent_mean", "latent_var", "observed"]
+        answer = client.occupancy(
+            points, with_gradient=arguments.gradient, evidence_only=arguments.evidence_only
+        )
+    names = ["mean", "var", "latent_mean", "latent_var", "observed", "borrowed"]
     names += ["gradient", "latent_gradient"] if arguments.gradient else []
     if arguments.out is not None:
         save_npz(
@@ -82,11 +87,20 @@ def run(arguments: argparse.Namespace) -> int:
             f"{answer.latent_mean[i]:+.3f}",
             f"{math.sqrt(answer.latent_var[i]):.3f}",
             "yes" if answer.observed[i] else "no",
+            f"{answer.borrowed[i]:.2f}",
             *([] if answer.gradient is None else [f"{g:+.4f}" for g in answer.gradient[i]]),
         ]
         for i in range(min(len(points), _SHOWN))
     ]
-    heads = [*["x", "y", "z"][: points.shape[1]], "P(occupied)", "std", "log-odds", "std", "observed"]
+    heads = [
+        *["x", "y", "z"][: points.shape[1]],
+        "P(occupied)",
+        "std",
+        "log-odds",
+        "std",
+        "observed",
+        "borrowed",
+    ]
     heads += ["dP/dx 1/m", "dP/dy", "dP/dz"] if arguments.gradient else []
     say_rows(heads, rows, len(points), "-o FILE or --json FILE")
     say(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -19,17 +19,22 @@ from potschemas import messages
 ProgressCallback = Callable[[int, int], None]  # (parts received, parts in all)
 
 
-def grid(
-    link: Link,
-    lower: ArrayLike,
-    upper: ArrayLike,
-    resolution: float,
-    *,
-    progress: ProgressCallback | None,
-    timeout_s: float | None,
-) -> Grid:
+class Wanted(NamedTuple):
+    """What is asked; see `MapClient.grid`."""
+
+    lower: ArrayLike
+    upper: ArrayLike
+    resolution: float
+    evidence_only: bool
+
+
+def grid(link: Link, wanted: Wanted, *, progress: ProgressCallback | None, timeout_s: float | None) -> Grid:
     """See `MapClient.grid`."""
-    lower_m, upper_m = corner(lower, "lower"), corner(upper, "upper")
+    lower_m, upper_m, resolution = (
+        corner(wanted.lower, "lower"),
+        corner(wanted.upper, "upper"),
+        wanted.resolution,
+    )
     if not (upper_m > lower_m).all() or not (math.isfinite(resolution) and resolution > 0):
         raise UsageError(
             f"grid: lower {lower_m.tolist()} must be below upper {upper_m.tolist()}, resolution positive"
@@ -39,6 +44,7 @@ def grid(
         upper=upper_m.tolist(),
         resolution=resolution,
         deadline_ms=link.deadline_ms(timeout_s),
+        evidence_only=True if wanted.evidence_only else messages.ABSENT,
     )
     assembly: _Assembly | None = None
     cells = np.ceil((upper_m - lower_m) / resolution - 1e-6)
@@ -64,7 +70,7 @@ class _Assembly:
         self._first = first
         n = math.prod(first.shape)
         self._arrays: dict[str, NDArray[Any]] = {
-            name: np.zeros(n, np.float32) for name in ("mean", "var", "latent_mean", "latent_var")
+            name: np.zeros(n, np.float32) for name in ("mean", "var", "latent_mean", "latent_var", "borrowed")
         }
         self._arrays["observed"] = np.zeros(n, np.bool_)
         self._filled = np.zeros(n, np.bool_)

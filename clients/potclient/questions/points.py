@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -25,6 +25,11 @@ _RETRIES = 8
 _BYTES_AROUND = 1024  # of a message, beside its points
 
 
+class _Wanted(NamedTuple):
+    gradient: bool
+    evidence_only: bool
+
+
 class PointsQuestion:
     """Asks at points, and remembers the server's limits."""
 
@@ -32,22 +37,25 @@ class PointsQuestion:
         self._link = link
         self.limits: messages.Limits | None = None  # None: not asked for yet
 
-    def occupancy(self, points: ArrayLike, *, with_gradient: bool, timeout_s: float | None) -> Occupancy:
+    def occupancy(
+        self, points: ArrayLike, *, with_gradient: bool, evidence_only: bool, timeout_s: float | None
+    ) -> Occupancy:
         """See `MapClient.occupancy`."""
         dtype = np.float32 if getattr(points, "dtype", None) == np.float32 else np.float64
         queries = np.ascontiguousarray(as_points(points), dtype)
         if len(queries) == 0:
             return Occupancy.empty(with_gradient=with_gradient)
+        wanted = _Wanted(with_gradient, evidence_only)
         may_fit = len(queries) <= _SPLIT_ABOVE and self.limits is None
         step = len(queries) if may_fit else self._points_a_question(queries.itemsize * 3)
         chunks = [queries[i : i + step] for i in range(0, len(queries), step)]
         if len(chunks) == 1:
-            reply = next(self._ask(queries, with_gradient, timeout_s))
+            reply = next(self._ask(queries, wanted, timeout_s))
             return Occupancy.from_message(reply, len(queries), with_gradient=with_gradient)
-        return Occupancy.concatenate(list(self._of_chunks(chunks, with_gradient, timeout_s)))
+        return Occupancy.concatenate(list(self._of_chunks(chunks, wanted, timeout_s)))
 
     def _of_chunks(
-        self, chunks: list[NDArray[Any]], with_gradient: bool, timeout_s: float | None
+        self, chunks: list[NDArray[Any]], wanted: _Wanted, timeout_s: float | None
     ) -> Iterator[Occupancy]:
         timeout_s = _IN_FLIGHT * (self._link.timeout_s if timeout_s is None else timeout_s)
         asked: deque[tuple[NDArray[Any], Iterator[messages.Occupancy]]] = deque()
@@ -55,25 +63,26 @@ class PointsQuestion:
         while waiting or asked:
             while waiting and len(asked) < _IN_FLIGHT:
                 chunk = waiting.popleft()
-                asked.append((chunk, self._ask(chunk, with_gradient, timeout_s)))
+                asked.append((chunk, self._ask(chunk, wanted, timeout_s)))
             chunk, replies = asked.popleft()
             for attempt in range(_RETRIES + 1):
                 try:
-                    yield Occupancy.from_message(next(replies), len(chunk), with_gradient=with_gradient)
+                    yield Occupancy.from_message(next(replies), len(chunk), with_gradient=wanted.gradient)
                     break
                 except OverloadedError as error:
                     if attempt == _RETRIES:
                         raise
                     time.sleep(error.retry_after_s or 0.1)
-                    replies = self._ask(chunk, with_gradient, timeout_s)
+                    replies = self._ask(chunk, wanted, timeout_s)
 
     def _ask(
-        self, chunk: NDArray[Any], with_gradient: bool, timeout_s: float | None
+        self, chunk: NDArray[Any], wanted: _Wanted, timeout_s: float | None
     ) -> Iterator[messages.Occupancy]:
         request = messages.PointsQuery(
             points=encode_array(chunk),
             deadline_ms=self._link.deadline_ms(timeout_s),
-            with_gradient=True if with_gradient else messages.ABSENT,
+            with_gradient=True if wanted.gradient else messages.ABSENT,
+            evidence_only=True if wanted.evidence_only else messages.ABSENT,
         )
         return self._link.stream(self._link.keys.query("points"), request, messages.Occupancy, timeout_s)
 

@@ -12,7 +12,8 @@ from potserver.limits import Limits
 
 
 def _plan(asked: Asked, query: messages.GridQuery) -> GridPlan:
-    return Grid(query.lower, query.upper, query.resolution).plan(asked.snapshot, asked.limits)
+    grid = Grid(query.lower, query.upper, query.resolution, query.evidence_only is True)
+    return grid.plan(asked.snapshot, asked.limits)
 
 
 def encode_part(plan: GridPlan, number: int, run: GridRun) -> messages.GridPart:

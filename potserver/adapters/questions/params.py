@@ -19,7 +19,7 @@ def _encode(plan: ParamsPlan, number: int, kernels: KernelSet) -> messages.Param
         part=number,
         n_parts=plan.n_parts,
         map_revision=plan.map_revision,
-        kernels=encode_kernels(kernels, plan.rule),
+        kernels=encode_kernels(kernels, plan.rule, plan.lean_of_part(number)),
     )
 
 

@@ -19,7 +19,11 @@ def decode_points(query: messages.PointsQuery) -> Points:
         ShapeError: the array has the wrong dtype, shape or byte count.
     """
     points = decode_array(query.points, "points", FLOATS, (None, (2, 3)))
-    return Points(points, with_gradient=query.with_gradient is True)
+    return Points(
+        points,
+        with_gradient=query.with_gradient is True,
+        evidence_only=query.evidence_only is True,
+    )
 
 
 def _plan(asked: Asked, query: messages.PointsQuery) -> PointsPlan:

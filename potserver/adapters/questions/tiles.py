@@ -9,7 +9,7 @@ from potschemas.messages import DType
 from potserver.adapters.questions.question import Asked, Question
 from potserver.asking.tiles import KnownTiles, TileRun, Tiles, TilesPlan
 from potserver.codec.base import typed_errors
-from potserver.codec.kernels import code_kernels
+from potserver.codec.kernels import code_kernels, encode_lean
 from potserver.codec.tile_changes import code_changes
 from potserver.errors import BadMessageError
 from potserver.limits import Limits
@@ -53,6 +53,7 @@ def encode_part(plan: TilesPlan, number: int, run: TileRun) -> messages.TilesPar
         gone=wire.pack_array(plan.gone.T) if number == 0 and len(plan.gone) else None,
         kernels=code_kernels(run.kernels, plan.spacings_m),
         changes=messages.ABSENT if plan.coding is None else code_changes(run.changes, plan.coding.steps),
+        lean=messages.ABSENT if run.leans is None else encode_lean(*run.leans),
         **plan.rule.fields(),
     )
 

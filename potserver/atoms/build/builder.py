@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import collections
+import contextlib
 import dataclasses
 import functools
 from collections.abc import Callable, Iterator
@@ -13,12 +14,16 @@ from potserver.atoms.build.engines import Engine
 from potserver.atoms.build.recipe import Recipe, located
 from potserver.atoms.build.scan_task import Candidate, Progress, ScanResult, ScanTask, learn_scan
 from potserver.atoms.cover import greedy_cover
+from potserver.atoms.heights import learn_heights
 from potserver.domain.dictionary import AtomDictionary
-from potserver.errors import DictionaryError
-from potserver.recordings import open_recording
+from potserver.domain.types import Scan
+from potserver.errors import DictionaryError, PotserverError
+from potserver.numerics.heights import HeightModels
+from potserver.recordings import open_recording, to_scan
 
 COVERED = "near a kept atom"
 OVER_LIMIT = "beyond max_atoms"
+_TOLD_BY = 16  # scans of a recording, at most, that heights are learned from
 
 
 @dataclasses.dataclass(slots=True)
@@ -131,7 +136,26 @@ def build(
     for dims in (3, 2):
         _choose(recipe, dims, candidates, reports, threads, on_chosen)
     atoms = [candidate.atom for report in reports for candidate in report.kept]
-    return Built(dictionary=AtomDictionary(tuple(atoms)), reports=reports)
+    return Built(dictionary=AtomDictionary(atoms, heights=heights_of(recipe, tasks)), reports=reports)
+
+
+def heights_of(recipe: Recipe, tasks: list[ScanTask]) -> HeightModels | None:
+    """What the recordings of tasks say of heights above the ground, by scans from all over each; None if none can tell."""
+    deep = {task.recording: task for task in tasks if task.dims != 2}
+    reach = max((task.settings.max_range_m for task in deep.values()), default=0.0)
+    scans = (_scans_about(task) for task in deep.values())
+    return learn_heights(scans, max_range_m=reach, seed=recipe.seed)
+
+
+def _scans_about(task: ScanTask) -> Iterator[Scan]:
+    """Some scans of a task's recording, evenly spread; what cannot be read is left out, for its own task reports it."""
+    try:
+        recording = open_recording(task.dataset, task.reader)
+    except (DatasetError, OSError):
+        return
+    for number in range(0, len(recording), -(-len(recording) // _TOLD_BY)):
+        with contextlib.suppress(DatasetError, PotserverError, OSError):
+            yield to_scan(recording[number], number)
 
 
 def _choose(

@@ -1,0 +1,127 @@
+"""A map that leans: on what the dictionary expects where little was seen, and on nothing where it cannot."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from potclient.metrics import score
+from potclient.towns import TownRecording
+from potserver.domain.dictionary import AtomDictionary
+from potserver.domain.types import Scan, yaw_pose
+from potserver.mapping import leaning
+from potserver.mapping.service import MappingService
+from potserver.recordings import Reader, open_recording, to_scan
+
+HEIGHTS = AtomDictionary((), heights=AtomDictionary.builtin().heights)
+
+
+@pytest.fixture(scope="module")
+def street() -> TownRecording:
+    return open_recording("town:suburb:vlp16:60m:31", Reader(max_range_m=20.0))
+
+
+def few_rings(street: TownRecording, number: int, every: int) -> tuple[Scan, Scan]:
+    """A scan's beams of every so many elevations, and all others."""
+    whole = to_scan(street[number], number)
+    x, y, z = whole.points.T.astype(float)
+    ring = np.rint(np.degrees(np.arctan2(z, np.hypot(x, y)))).astype(int) // 2
+    kept = ring % every == 0
+    thin, rest = (
+        Scan(points=whole.points[m], is_return=whole.is_return[m], T_map_sensor=whole.T_map_sensor)
+        for m in (kept, ~kept)
+    )
+    return thin, rest
+
+
+def mapped(dictionary: AtomDictionary, *scans: Scan) -> MappingService:
+    service = MappingService(dictionary, threads=1)
+    for scan in scans:
+        service.integrate(scan)
+    return service
+
+
+def labels_of(scan: Scan) -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(0)
+    ends = scan.beams.ends
+    along = rng.random(len(ends))[:, None]
+    points = np.concatenate([ends[scan.is_return], ends * along]) + scan.origin
+    return points, np.arange(len(points)) < scan.is_return.sum()
+
+
+def test_between_rings_a_leaning_map_is_far_better(street: TownRecording) -> None:
+    thin, rest = few_rings(street, 5, 4)
+    points, occupied = labels_of(rest)
+    bare, leaning_map = (mapped(d, thin).snapshot.occupancy(points) for d in (AtomDictionary(()), HEIGHTS))
+    without, with_it = (score(a.mean, occupied) for a in (bare, leaning_map))
+    assert with_it.nll < 0.6 * without.nll
+    assert with_it.ece < without.ece
+    assert not bare.borrowed.any()
+    np.testing.assert_array_equal(leaning_map.observed, bare.observed)  # what is observed goes by evidence
+    assert (leaning_map.borrowed[~bare.observed] == 1.0).mean() > 0.95
+
+
+def test_evidence_only_borrows_nothing(street: TownRecording) -> None:
+    thin, rest = few_rings(street, 5, 2)
+    points, _ = labels_of(rest)
+    snapshot = mapped(HEIGHTS, thin).snapshot
+    answer, own = snapshot.occupancy(points), snapshot.occupancy(points, evidence_only=True)
+    assert not own.borrowed.any()
+    assert (own.mean[~own.observed] == 0.5).all()
+    assert (answer.mean[~own.observed] != 0.5).mean() > 0.9
+    sure = answer.observed & (answer.borrowed == 0.0)
+    np.testing.assert_allclose(answer.mean[sure], own.mean[sure], rtol=1e-6)
+
+
+def test_with_more_evidence_less_is_borrowed(street: TownRecording) -> None:
+    scans = [to_scan(street[i], i) for i in (4, 5, 6)]
+    points, _ = labels_of(few_rings(street, 5, 2)[1])
+    shares = [mapped(HEIGHTS, *scans[:n]).snapshot.occupancy(points).borrowed.mean() for n in (1, 3)]
+    assert shares[1] < shares[0]
+
+
+def test_a_tile_keeps_the_lean_that_its_evidence_began_with(street: TownRecording) -> None:
+    service = mapped(HEIGHTS, to_scan(street[0], 0))
+    assert service.state.tiled is not None
+    first = {
+        i: t.lean for i, t in service.state.tiled.tiles.items() if t.lean is not None and len(t.rows.kind)
+    }
+    service.integrate(to_scan(street[10], 1))
+    assert len(first) > 3
+    assert all(service.state.tiled.tiles[i].lean is lean for i, lean in first.items())
+
+
+def test_forgetting_a_robot_forgets_what_was_expected_about_it(street: TownRecording) -> None:
+    service = mapped(HEIGHTS, to_scan(street[0], 0))
+    service.remove_robot("recording")
+    assert service.state.tiled is not None
+    assert not service.state.tiled.tiles
+    assert service.snapshot.lean is None
+
+
+@pytest.mark.parametrize(
+    ("dictionary", "scan", "reason"),
+    [
+        (AtomDictionary(()), "ground", leaning.NO_MODEL),
+        (HEIGHTS, "planar", leaning.PLANAR),
+        (HEIGHTS, "wall", leaning.NO_GROUND),
+        (HEIGHTS, "grating", leaning.NOVEL),
+        (HEIGHTS, "ground", None),
+    ],
+)
+def test_a_map_says_why_it_does_not_lean(dictionary: AtomDictionary, scan: str, reason: str | None) -> None:
+    rng = np.random.default_rng(3)
+    ground = np.column_stack([rng.uniform(-12, 12, (2500, 2)), np.full(2500, -1.6)])
+    made = {
+        "ground": ground,
+        "planar": ground * [1, 1, 0],
+        "wall": np.column_stack([np.full(2500, 6.0), rng.uniform(-6, 6, 2500), rng.uniform(1, 5, 2500)]),
+        # a grating: a level floor that most beams go through
+        "grating": np.concatenate([ground[:600], np.column_stack([ground[:, :2], np.full(2500, -7.0)])]),
+    }[scan].astype(np.float32)
+    returned = np.arange(len(made)) < 600 if scan == "grating" else np.ones(len(made), bool)
+    service = MappingService(dictionary, threads=1)
+    pose, planar = yaw_pose(0, 0, 0), scan == "planar"
+    update = service.integrate(Scan(points=made, is_return=returned, T_map_sensor=pose, is_planar=planar))
+    assert update.not_leaning == reason
+    assert (service.snapshot.lean is None) == (reason is not None)
