@@ -90,7 +90,12 @@ class Driven:
     def __init__(self, folder: Path) -> None:
         self.mapper, self.order = MappingService(settings=_SETTINGS, threads=1), CloudOrder()
         self.store = MapStore(
-            folder, "default", keeps_evidence=True, health=Health(), snapshot_scans=_SNAPSHOT_SCANS
+            folder,
+            "default",
+            keeps_evidence=True,
+            health=Health(),
+            snapshot_scans=_SNAPSHOT_SCANS,
+            max_resident_bytes=1,  # everything goes to pages, and the disk may refuse those too
         )
         try:
             self.order.replace(self.store.restore(self.mapper).heard)
@@ -106,6 +111,7 @@ class Driven:
             self.order.check(scan.robot_id, scan.session, scan.seq)
             self.mapper.integrate(scan, commit=lambda: self.store.append(scan))
             self.order.remember(scan.robot_id, scan.session, scan.seq)
+            self.store.relieve(self.mapper)
             self.store.advance(self.mapper, self.order.heard)
         elif kind == "c":
             self.mapper.clear(commit=lambda state: self.store.replace(state, {}))

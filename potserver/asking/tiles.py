@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from potschemas.answers import AnswerRule
-from potserver.asking.plan import Plan, checked_box
+from potserver.asking.plan import Plan, checked_box, pieces
 from potserver.domain.map_state import MapState
 from potserver.domain.tiles import Tile, TileIndex
 from potserver.domain.types import Float32, KernelSet
@@ -129,17 +129,9 @@ class TilesPlan(Plan[TileRun]):
     def part(self, i: int) -> TileRun:
         """One run of kernels; a tile may go on in the next."""
         sizes = np.array([len(tile.kernels) for _, tile in self.tiles], np.int64)
-        ends = np.cumsum(sizes)
-        run = self.items(i)
-        start = np.maximum(run.start - (ends - sizes), 0)
-        counts = np.minimum(run.stop - (ends - sizes), sizes) - start
-        members = np.flatnonzero(counts > 0)
-        kernels = KernelSet.concatenate(
-            [
-                self.tiles[t][1].kernels.kernels.take(slice(int(start[t]), int(start[t] + counts[t])))
-                for t in members
-            ]
-        )
+        found = list(pieces(sizes, self.items(i)))
+        members = [t for t, _ in found]
+        kernels = KernelSet.concatenate([self.tiles[t][1].kernels.kernels.take(cut) for t, cut in found])
         if self.mantissa_bits < MANTISSA_BITS:
             kernels = kernels.replace(
                 weight_mean=rounded(kernels.weight_mean, self.mantissa_bits),
@@ -148,7 +140,7 @@ class TilesPlan(Plan[TileRun]):
         return TileRun(
             np.array([self.tiles[t][0] for t in members], np.int64).reshape(-1, 3),
             np.array([self.tiles[t][1].revision for t in members], np.int64),
-            counts[members],
+            np.array([cut.stop - cut.start for _, cut in found], np.int64),
             kernels,
         )
 
