@@ -11,9 +11,10 @@ from potserver.adapters.poses import WAIT_S, PoseNotYetError
 from potserver.adapters.receipts import ReceiptSender
 from potserver.adapters.replies import BUG
 from potserver.adapters.stamps import check_not_future
+from potserver.domain.map_size import MapSize
 from potserver.domain.map_state import MapState
 from potserver.domain.order import CloudOrder
-from potserver.domain.tiles import MapSize, check_reach
+from potserver.domain.tiles import check_reach
 from potserver.domain.types import Float64, TileChange
 from potserver.errors import MapFullError, PotserverError
 from potserver.health import Health
@@ -146,7 +147,7 @@ class MapWriter:
         return f"nothing from {robot_id} is left, {len(changed.tiles)} tiles changed"
 
     def _check_room(self, robot_id: str) -> None:
-        n_bytes = self._size.of(self._mapper.state.tiled)
+        n_bytes = self._size.of(self._mapper.state)
         if n_bytes >= self._bounds.max_map_bytes:
             raise MapFullError(
                 f"the map has {n_bytes} bytes, the limit is {self._bounds.max_map_bytes} (limits.max_map_bytes): save and clear"

@@ -27,9 +27,9 @@ from potserver.domain.tiles import Tile, TiledMap, TileIndex, part_of, tiles_of_
 _PAGE = mmap.ALLOCATIONGRANULARITY
 _SEGMENT_BYTES = 256 * 2**20  # of the file are mapped at once; what was not written takes no room
 _ALIGNED = 64  # bytes: a line of the processor's cache
-_LEAST_BYTES = 1024  # smaller arrays are not worth their administration
+_LEAST_BYTES = _ALIGNED  # smaller arrays would take no less on a page
 _READY_AT_ONCE = 64  # parts of a map that is read
-_AT_ONCE = 32 * 2**20  # bytes below the limit that are aimed at: snapshots are indexed anew each time
+_AT_ONCE = 8 * 2**20  # bytes below the limit that are aimed at: snapshots are indexed anew each time
 
 
 class _Extent(np.ndarray[Any, np.dtype[np.uint8]]):

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-from collections import Counter
 from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
@@ -205,46 +204,6 @@ class TiledMap(NamedTuple):
             else:
                 parts[number] = part
         return self._replace(tiles=tiles, parts=parts)
-
-
-class MapSize:
-    """The bytes of a map that changes tile by tile: only tiles that are not those of before are counted anew."""
-
-    def __init__(self) -> None:
-        self._counted: dict[TileIndex, tuple[int, dict[int, int]]] = {}  # bytes of a tile, and of each robot
-        self._tiles: Mapping[TileIndex, Tile] = {}
-        self._robots: tuple[str, ...] = ()
-        self._n_bytes = 0
-        self._of_robot: Counter[int] = Counter()
-
-    def of(self, tiled: TiledMap | None) -> int:
-        """About how many bytes it takes in memory and on pages."""
-        before, after = self._tiles, {} if tiled is None else tiled.tiles
-        if before is not after:
-            for index in before.keys() | after.keys():
-                old, new = before.get(index), after.get(index)
-                if old is not new:
-                    self._count(index, new)
-        self._tiles, self._robots = after, () if tiled is None else tiled.robots
-        return self._n_bytes
-
-    def of_robot(self, robot_id: str) -> int:
-        """How many of these a robot has caused: of each tile as large a share as of its rows."""
-        return self._of_robot[self._robots.index(robot_id)] if robot_id in self._robots else 0
-
-    def _count(self, index: TileIndex, tile: Tile | None) -> None:
-        n_bytes, shares = self._counted.pop(index, (0, {}))
-        self._n_bytes -= n_bytes
-        self._of_robot.subtract(shares)
-        if tile is not None:
-            n_rows = np.bincount(tile.rows.source)
-            shares = {
-                int(robot): int(n_rows[robot]) * tile.n_bytes // len(tile.rows.source)
-                for robot in np.flatnonzero(n_rows)
-            }
-            self._counted[index] = tile.n_bytes, shares
-            self._n_bytes += tile.n_bytes
-            self._of_robot.update(shares)
 
 
 def check_reach(tiled: TiledMap, T_map_tiled: Float64, max_coordinate_m: float) -> None:
