@@ -62,15 +62,13 @@ class PageFile:
         Raises:
             OSError: the disk refuses; nothing was moved.
         """
-        places: list[tuple[NDArray[Any], int]] = []
-        n_bytes = 0
-        for array in arrays:
-            places.append((np.ascontiguousarray(array), n_bytes))
-            n_bytes += -(-array.nbytes // _ALIGNED) * _ALIGNED
-        run = self._take(-(-n_bytes // _PAGE) * _PAGE)
+        starts = np.cumsum([0, *(-(-array.nbytes // _ALIGNED) * _ALIGNED for array in arrays)]).tolist()
+        run = self._take(-(-starts[-1] // _PAGE) * _PAGE)
+        content = np.zeros(run.n_bytes, np.uint8)
+        for array, at in zip(arrays, starts, strict=False):
+            content[at : at + array.nbytes] = np.ascontiguousarray(array).reshape(-1).view(np.uint8)
         try:
-            for array, at in places:
-                self._write(array, run.start + at)
+            self._write(content, run.start)
         except OSError:
             self._dropped.append(run)
             raise
@@ -78,9 +76,9 @@ class PageFile:
         extent = _Extent((run.n_bytes,), np.uint8, segment, run.start - start)
         weakref.finalize(extent, self._dropped.append, run).atexit = False
         moved: dict[int, NDArray[Any]] = {}
-        for given, (array, at) in zip(arrays, places, strict=True):
-            moved[id(given)] = np.ndarray(array.shape, array.dtype, extent, at)
-            moved[id(given)].flags.writeable = given.flags.writeable
+        for array, at in zip(arrays, starts, strict=False):
+            moved[id(array)] = np.ndarray(array.shape, array.dtype, extent, at)
+            moved[id(array)].flags.writeable = array.flags.writeable
         return moved
 
     @property
@@ -94,8 +92,8 @@ class PageFile:
             os.close(self._fd)
             self._fd = -1
 
-    def _write(self, array: NDArray[Any], at: int) -> None:
-        left = array.reshape(-1).view(np.uint8).data
+    def _write(self, content: NDArray[np.uint8], at: int) -> None:
+        left = content.data
         while left:
             n = os.pwrite(self._fd, left, at)
             left, at = left[n:], at + n
