@@ -90,7 +90,6 @@ class MapStore:
         fsync: bool = True,
         snapshot_scans: int = SNAPSHOT_SCANS,
         snapshot_bytes: int = SNAPSHOT_BYTES,
-        max_saved: int = MAX_SAVED,
         max_resident_bytes: int = RESIDENT_BYTES,
     ) -> None:
         """Open the folder `<folder>/<map_id>`, or make it.
@@ -103,7 +102,6 @@ class MapStore:
             fsync: Wait for the disk with each scan. Without, a crash of the machine may take the last ones; a crash of the
                 process does not.
             snapshot_scans, snapshot_bytes: A snapshot is written after so many scans, or so many bytes of the journal.
-            max_saved: Copies with a name that may lie in `<folder>/saved/<map_id>`.
             max_resident_bytes: Of the map that stay in memory; the rest lies in a file without a name in the folder.
         Raises:
             StorageError: another server has the folder, or the disk refuses.
@@ -113,7 +111,7 @@ class MapStore:
         self._saved = folder / SAVED / map_id
         self._map_id, self._keeps_evidence, self._health = map_id, keeps_evidence, health
         self._snapshot_scans, self._snapshot_bytes = snapshot_scans, snapshot_bytes
-        self._max_saved, self._fsync = max_saved, fsync
+        self._fsync = fsync
         make_private_folder(folder)
         make_private_folder(self.folder)
         has_begun = check_complete(self.folder)
@@ -292,9 +290,9 @@ class MapStore:
             return f"the snapshot holds all {state.n_scans} scans"
         path = self._saved / f"{name}.map"
         others = [p for p in self._saved.glob("*.map") if p != path]
-        if len(others) >= self._max_saved:
+        if len(others) >= MAX_SAVED:
             raise TooLargeError(
-                f"{len(others)} maps are saved already, the limit is {self._max_saved}: move some out of {self._saved}"
+                f"{len(others)} maps are saved already, the limit is {MAX_SAVED}: move some out of {self._saved}"
             )
         make_private_folder(self._saved.parent)
         n_bytes = write_map(path, state, Origin(self._map_id, self._keeps_evidence, heard))
