@@ -27,7 +27,7 @@ class Limits:
         "of one map, by what one robot saw; its next cloud is refused `map_full`, those of others are not",
     ] = 4 * 2**30
     max_resident_bytes: Annotated[
-        int, "of one map in memory, about; what was changed longest ago lies on pages in its store"
+        int, "of one map in memory, about; what no scan has touched for longest lies on pages in its store"
     ] = 2 * 2**30
     max_robots: Annotated[int, "robots remembered at once: poses, presence"] = 1024
 
