@@ -116,12 +116,12 @@ class _Attempts:
         self._asks("clear, load, merge a map", is_operator, keys.control("clear"))
         self._asks("change the dictionary", is_operator, keys.control("atoms"))
         sizes = _SIZES | bounds.sizes
-        self._asks("ask as much as is let in", True, keys.query("points"), sizes["questions"])
-        self._asks("ask more than is let in", False, keys.query("points"), sizes["questions"] + 1)
+        self._asks("ask up to the size", True, keys.query("points"), sizes["questions"])
+        self._asks("ask beyond the size", False, keys.query("points"), sizes["questions"] + 1)
         for what, key in (("clouds", keys.cloud(name)), ("poses", keys.pose(name))):
-            self._puts(f"send {what} as large as are let in", is_robot, key, sizes[what])
-            self._puts(f"send {what} larger than are let in", False, key, sizes[what] + 1)
-        self._floods("send poses faster than they are let in", keys.pose(name), bounds.poses_hz)
+            self._puts(f"send {what} up to the size", is_robot, key, sizes[what])
+            self._puts(f"send {what} beyond the size", False, key, sizes[what] + 1)
+        self._floods("send poses beyond the rate", keys.pose(name), bounds.poses_hz)
 
     def _deed(self, name: str, may: bool) -> _Deed:
         self.deeds.append(_Deed(name, may))
