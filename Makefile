@@ -16,7 +16,7 @@ export NUMBA_CACHE_DIR := $(CURDIR)/$(VENV)/numba-cache
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
 .DEFAULT_GOAL := help
-.PHONY: help venv demo torture test check lint format-check types imports schemas-check bench fix lock build images clean distclean
+.PHONY: help venv demo torture test check lint format-check types imports schemas-check bench fix lock build docs wheels images clean distclean
 
 help: ## this list
 	@echo "usage: make TARGET [PYTHON=/path/to/python3] [ARGS='...']"
@@ -112,6 +112,13 @@ lock: $(READY) ## write locks/ anew, after a change of pyproject.toml or constra
 build: $(READY) ## wheels of potserver and of the torch-free potclient, into dist
 	$(BIN)/python -m hatchling build -d dist
 	cd clients && ../$(BIN)/python -m hatchling build -t wheel -d ../dist
+
+docs: $(READY) ## the site of the documents, into out/docs (Python 3.11 or newer)
+	@NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --quiet
+	@echo "docs: open out/docs/index.html, or serve them: $(BIN)/python -m http.server -d out/docs"
+
+wheels: build ## the wheels in bare environments, from a folder of wheels alone: out/wheels
+	@bash .ci/wheels
 
 images: ## the server's and the client's container images
 	docker compose -f docker/compose.yaml --profile load build

@@ -2,18 +2,15 @@
 # Name the base image by its digest where builds must repeat: --build-arg BASE=python:3.11-slim-bookworm@sha256:...
 ARG BASE=python:3.11-slim-bookworm
 FROM ${BASE} AS build
-# Where pip looks, if not in its default place: torch there may be the CUDA build, of several GB, and a CPU build is enough.
+# Where pip looks, if not in its default place.
 ARG PIP_INDEX_URL=
 ARG PIP_EXTRA_INDEX_URL=
-ARG PIP_FIND_LINKS=
 ENV PIP_NO_CACHE_DIR=1 PIP_DISABLE_PIP_VERSION_CHECK=1
 WORKDIR /src
-COPY constraints.txt ./
 COPY locks locks
-# everything by its hash, but for torch: each of its builds has its own
+# everything by its hash
 RUN python -m venv /opt/build && /opt/build/bin/pip install -q --no-deps --require-hashes -r locks/build.txt
 RUN python -m venv /opt/potserver && /opt/potserver/bin/pip install -q --no-deps --require-hashes -r locks/server.txt
-RUN /opt/potserver/bin/pip install -q -c constraints.txt torch
 COPY pyproject.toml README.md LICENSE NOTICE ./
 COPY potserver potserver
 COPY clients clients
@@ -23,9 +20,6 @@ RUN /opt/build/bin/python -m hatchling build -t wheel -d /dist && /opt/potserver
 RUN /opt/build/bin/cyclonedx-py environment /opt/potserver --pyproject pyproject.toml -o /opt/potserver/sbom.cdx.json
 
 FROM ${BASE}
-# what open3d links to
-RUN apt-get update && apt-get install -y --no-install-recommends libgl1 libgomp1 libudev1 libx11-6 \
-    && rm -rf /var/lib/apt/lists/*
 RUN useradd --system --uid 10001 --create-home --home-dir /var/lib/potserver potserver
 RUN install -d -m 0700 -o potserver -g potserver /var/lib/potserver /var/cache/potserver
 COPY --from=build /opt/potserver /opt/potserver

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from potclient.arrays import Float32
 from potclient.cells import CellBox, MapSource, Progress, grids
 from potclient.errors import UsageError
 from potclient.files import whole
@@ -149,16 +150,8 @@ def export_pgm(
         raise UsageError(
             f"{path}: name the picture, e.g. {path.with_suffix('.pgm')}; the YAML goes beside it"
         )
-    nx, ny, _ = (box.stop - box.first).tolist()
-    likeliest = np.full((nx, ny), -1.0, np.float32)  # -1: nothing observed
-    revisions = set()
-    wanted = None if band is None else lambda tile: bool(band.inside(tile).any())
-    for tile, grid in grids(source, box, progress, wanted):
-        x, y = (slice(int(tile.first[a] - box.first[a]), int(tile.stop[a] - box.first[a])) for a in (0, 1))
-        counts = grid.observed if band is None else grid.observed & band.inside(tile)
-        column = np.where(counts, grid.mean, np.float32(-1)).max(axis=2)
-        likeliest[x, y] = np.maximum(likeliest[x, y], column)
-        revisions.add(grid.revision)
+    likeliest, revisions = likeliest_of_columns(source, box, band, progress)
+    nx, ny = likeliest.shape
     pixels = np.full((nx, ny), _UNKNOWN_PIXEL, np.uint8)
     pixels[(likeliest >= 0) & (likeliest < free_below)] = _FREE_PIXEL
     pixels[likeliest >= occupied_above] = _OCCUPIED_PIXEL
@@ -172,7 +165,32 @@ def export_pgm(
     )
     with whole(path.with_suffix(".yaml")) as file:
         file.write(text.encode())
-    return Exported(nx * ny, tuple(sorted(revisions)))
+    return Exported(nx * ny, revisions)
+
+
+def likeliest_of_columns(
+    source: MapSource, box: CellBox, band: Band | None = None, progress: Progress | None = None
+) -> tuple[Float32, tuple[int, ...]]:
+    """The map seen from above.
+
+    Args:
+        box: Columns and the heights that count.
+        band: Cells outside do not count, nor do columns without ground.
+    Returns:
+        (nx, ny) P(occupied) of the likeliest observed cell of each column, -1 where there is none; the revisions, ascending.
+    Raises:
+        PotclientError: see `MapClient.grid`.
+    """
+    likeliest = np.full((box.stop - box.first)[:2], -1.0, np.float32)
+    revisions = set()
+    wanted = None if band is None else lambda tile: bool(band.inside(tile).any())
+    for tile, grid in grids(source, box, progress, wanted):
+        x, y = (slice(int(tile.first[a] - box.first[a]), int(tile.stop[a] - box.first[a])) for a in (0, 1))
+        counts = grid.observed if band is None else grid.observed & band.inside(tile)
+        column = np.where(counts, grid.mean, np.float32(-1)).max(axis=2)
+        likeliest[x, y] = np.maximum(likeliest[x, y], column)
+        revisions.add(grid.revision)
+    return likeliest, tuple(sorted(revisions))
 
 
 def export_bt(

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from potclient.arrays import Float32, Float64
 from potclient.cells import CellBox, MapSource, Progress, grid_of
 from potclient.errors import UsageError
+from potclient.extras import how_to_install
 from potclient.files import whole
 from potclient.occupancy import Grid
 
@@ -62,7 +63,7 @@ def mesh_of(grid: Grid) -> Mesh:
     try:
         from skimage.measure import marching_cubes
     except ImportError as error:
-        raise UsageError("surfaces need the package scikit-image: pip install 'potserver[mesh]'") from error
+        raise UsageError(f"surfaces need the package scikit-image: {how_to_install('mesh')}") from error
     none = Mesh(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int64), np.zeros(0, np.float32))
     seen = grid.mean[grid.observed]
     if min(grid.shape) < 2 or not len(seen) or not seen.min() < _LEVEL < seen.max():
@@ -110,7 +111,7 @@ def export_mesh(
     try:
         import trimesh
     except ImportError as error:
-        raise UsageError("meshes need the package trimesh: pip install 'potserver[mesh]'") from error
+        raise UsageError(f"meshes need the package trimesh: {how_to_install('mesh')}") from error
     parts, revisions = [], set()
     for part, revision in meshes(source, box, progress):
         parts.append(part)

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from potclient.errors import UsageError
+from potclient.extras import how_to_install
 from potclient.occupancy import Grid
 
 _UNKNOWN = "#e4e4e4"
@@ -85,7 +86,7 @@ def load_pyplot() -> Any:
     try:
         import matplotlib
     except ImportError as error:
-        raise UsageError("pictures need the package matplotlib: pip install matplotlib") from error
+        raise UsageError(f"pictures need the package matplotlib: {how_to_install('pictures')}") from error
     matplotlib.use("Agg")
     from matplotlib import pyplot
 

@@ -15,6 +15,15 @@ def yaw_pose(x_m: float, y_m: float, yaw_rad: float, z_m: float = 0.0) -> Float6
     return np.array([[c, -s, 0, x_m], [s, c, 0, y_m], [0, 0, 1, z_m], [0, 0, 0, 1]], np.float64)
 
 
+def euler_pose(translation: Float64, roll: float, pitch: float, yaw: float) -> Float64:
+    """(4, 4) of a translation (3,), m, and turns about x, then y, then z of the fixed axes, radians."""
+    pose = yaw_pose(0.0, 0.0, yaw)
+    (cp, sp), (cr, sr) = ((math.cos(angle), math.sin(angle)) for angle in (pitch, roll))
+    pose[:3, :3] @= np.array([[cp, sp * sr, sp * cr], [0, cr, -sr], [-sp, cp * sr, cp * cr]])
+    pose[:3, 3] = translation
+    return pose
+
+
 def quaternion_rotation(w: float, x: float, y: float, z: float) -> Float64:
     """(3, 3) of a quaternion of length one."""
     return np.array(

@@ -1,4 +1,4 @@
-"""Draw the README's picture: a map that grows in 3D, scan by scan.
+"""Draw the picture of docs/index.md: a map that grows in 3D, scan by scan.
 
     python docs/pictures/growing_map.py
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import collections
 import contextlib
+import importlib.util
 import signal
 import sys
 import time
@@ -14,6 +15,7 @@ from types import FrameType
 from typing import TYPE_CHECKING, Any
 
 from potclient.commands.output_files import output_file
+from potclient.extras import how_to_install
 from potserver.commands.shared import (
     EXIT_FORCED,
     EXIT_OK,
@@ -111,6 +113,7 @@ def _build(options: argparse.Namespace) -> Built:
         SettingsError: the recipe is wrong, or there is nowhere to write.
         KeyboardInterrupt: at Ctrl-C or SIGTERM; nothing is written then.
     """
+    _check_installed()
     from potserver.atoms.build.builder import build, scan_tasks
 
     recipe, folder = recipe_of(options)
@@ -154,6 +157,17 @@ def _workers(options: argparse.Namespace) -> int:
     if workers < 1:
         raise DictionaryError(f"--workers {workers}: need at least 1")
     return int(workers)
+
+
+def _check_installed() -> None:
+    """Refuse before any work.
+
+    Raises:
+        DictionaryError: a package that learning needs is missing.
+    """
+    missing = [name for name in ("torch", "open3d") if importlib.util.find_spec(name) is None]
+    if missing:
+        raise DictionaryError(f"learning atoms needs {' and '.join(missing)}: {how_to_install('learn')}")
 
 
 def recipe_of(options: argparse.Namespace) -> tuple[Recipe, Path]:

@@ -17,6 +17,7 @@ from potclient.errors import DatasetError, UsageError
 from potclient.holdout import HoldOut
 from potschemas import __version__
 from potserver import bundled
+from potserver.commands import eval_paper
 from potserver.commands.eval_tables import tables_of
 from potserver.commands.shared import (
     EXIT_OK,
@@ -49,7 +50,11 @@ and harm N.
 
 Towns and the gauntlet (doorways, poles and wires) are asked about their exact truth too. Times are of maps that take
 turns, scan by scan, in this process.
---peers needs `pip install 'potserver[peers]'` for OctoMap."""
+--peers needs the extra `peers` for OctoMap.
+
+`potserver eval paper` is another thing: the tables of the paper and of its text, on made-up towns in 2D and 3D and on
+recordings, the paper's figures beside ours. It lists them; --table runs one. What was found is kept in --out, and a run
+that was stopped goes on from there."""
 
 _EXAMPLES = """\
 examples:
@@ -59,7 +64,9 @@ examples:
   potserver eval town:suburb:7 --profile paper --set mapping.max_range_m=15
   potserver eval gauntlet:vlp16 --peers octomap:0.05
   potserver eval /data/kitti/00 --scans 1 --rings 4
-  potserver eval bundled:rooms --peers grid"""
+  potserver eval bundled:rooms --peers grid
+  potserver eval paper --table towns --size small --out out/paper
+  potserver eval paper --all --data /data"""
 
 _COLUMNS = 160  # of the tables in a pipe
 
@@ -94,6 +101,9 @@ def add(commands: Any) -> None:
         "--json", type=output_file, metavar="FILE", help="all numbers, with the machine and the options"
     )
     out.add_argument("--markdown", type=output_file, metavar="FILE", help="the tables, for a document")
+    eval_paper.add_flags(
+        parser.add_argument_group("the paper's tables, with `paper` in place of a recording")
+    )
 
 
 def _add_beam_flags(beams: Any) -> None:
@@ -127,6 +137,9 @@ def _add_beam_flags(beams: Any) -> None:
 
 def _run(options: argparse.Namespace) -> int:
     """Evaluate on every dataset: tables as they are known, files at the end."""
+    if eval_paper.WORD in options.datasets:
+        return eval_paper.run(options)
+    eval_paper.refuse_flags(options)
     from potserver.log import configure_logging
     from potserver.numerics.threads import default_threads
 

@@ -5,20 +5,22 @@ free points scored apart and normalised; eight 45-degree turns of the atom; all 
 nearest point's displacement; full-circle crop; plain concatenation.
 
 What differs from their code: one fixed subsample an atom where they draw a new one a candidate, which makes their choice
-random; marginal errors in L1; a failed coupling is solved again with four times the reg, where they add noise; atoms keep at
-most 500 points a label, turned to their bisector; dispersions of position and gamma are carried, where they drop them; points
-without any kernel near are answered as unobserved.
+random; a sharper plan for the ranking; marginal errors in L1; a failed coupling is solved again with four times the reg, where
+they add noise; atoms keep at most 500 points a label, turned to their bisector; dispersions of position and gamma are carried
+and enter the answers, where they drop them; points without any kernel near are answered as unobserved.
 """
 
 from __future__ import annotations
 
 from potschemas.answers import AnswerRule
 from potserver.domain.map_state import MapState
+from potserver.domain.tiles import TiledMap
 from potserver.domain.types import KernelSet, Scan
 from potserver.mapping.carrying import Carrier
-from potserver.mapping.fusion import Fused, append
+from potserver.mapping.dispersions import integrated_out
+from potserver.mapping.fusion import Fused, Moment, append
 from potserver.mapping.matching import Ranking, RankScore
-from potserver.mapping.pipeline import Integrated, Method, Pipeline, ScanMap, integrated
+from potserver.mapping.pipeline import Integrated, LabelledScan, Method, Pipeline, ScanMap, integrated
 from potserver.mapping.sampling import Draws
 from potserver.mapping.sectors import SectorCut
 from potserver.mapping.stopwatch import Stopwatch
@@ -34,8 +36,10 @@ PAPER = Method(
         n_hits=200,
         n_free=50,
         voxel_m=0.0,
-        reg_m2=0.005 * _METRES**2,
-        tolerance=1e-6,
+        # at the authors' 0.005 nine of sixty choices in 2D towns, and six of fifteen in 3D, were others than without entropy;
+        # here one of seventy-five
+        reg_m2=0.0008 * _METRES**2,
+        tolerance=1e-3,
         score=RankScore.NORMALISED,
         rotations_deg=tuple(45.0 * k for k in range(-4, 4)),
         n_compared=256,
@@ -63,11 +67,10 @@ class PotPipeline(Pipeline):
         moment = self.moment(state, scan)
         with clock("label"):
             seen = self.label(scan, draws)
-        tiled, _ = self.ground(state, seen).with_robot(scan.robot_id)
-        carried = self.carry(seen, carrier, clock)
-        kernels = KernelSet.concatenate([done.kernels for _, done in carried.served()])
-        own = ScanMap(carried.reports(), kernels, kernels, converged=True)
-        fused = Fused(append(tiled, kernels, moment), len(kernels), len(kernels), True)
+        tiled, source = self.ground(state, seen).with_robot(scan.robot_id)
+        own = self.own_map(seen, carrier, tiled.grid.fine_m, clock)
+        with clock("fuse"):
+            fused = self.fuse(tiled, own, seen, source, moment)
         with clock("index"):
             tiled = tiled.with_tiles(fused.tiles, threads=self.threads)
             snapshot = self.snapshot(tiled, moment.revision, state.scores)
@@ -75,3 +78,14 @@ class PotPipeline(Pipeline):
             scores = self.check(snapshot, seen, state.scores, draws)
         after = MapState(snapshot=snapshot, tiled=tiled, stamp_ns=moment.stamp_ns, scores=scores)
         return integrated(state, after, seen, own, fused, clock.timings_ms)
+
+    def own_map(self, seen: LabelledScan, carrier: Carrier, resolution_m: float, clock: Stopwatch) -> ScanMap:
+        """The scan's instantaneous map: what was carried, its dispersions integrated out."""
+        carried = self.carry(seen, carrier, clock)
+        kernels = KernelSet.concatenate([done.kernels for _, done in carried.served()])
+        prior = integrated_out(kernels, planar=seen.scan.is_planar)
+        return ScanMap(carried.reports(), prior, prior, converged=True)
+
+    def fuse(self, tiled: TiledMap, own: ScanMap, seen: LabelledScan, source: int, moment: Moment) -> Fused:
+        """The overall map's tiles with all that was carried."""
+        return Fused(append(tiled, own.prior, moment), len(own.prior), len(own.prior), True)

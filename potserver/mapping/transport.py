@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
@@ -13,6 +13,14 @@ from potserver.numerics.displacement import OutOfSample, carry
 from potserver.numerics.geometry import in_sector, rotated_diagonal, rotation_z, thin
 
 _RETRY_REG_FACTOR = 4.0  # an unconverged coupling is solved once more, blurrier
+
+
+class Solve(Protocol):
+    """A solver of eq. 4; `couple` is the balanced one. `reg` is a share of the largest cost."""
+
+    def __call__(
+        self, source: Float32, target: Float32, *, reg: float, tolerance: float, max_iterations: int
+    ) -> Coupling: ...
 
 
 class CouplingOptions(NamedTuple):
@@ -28,6 +36,7 @@ class CouplingOptions(NamedTuple):
     # kernels carried out of their sector are left out; false: only those out of the circle
     stays_in_sector: bool = True
     out_of_sample: OutOfSample = OutOfSample.NEAREST
+    solve: Solve = couple
 
 
 class Transported(NamedTuple):
@@ -105,7 +114,7 @@ def _subsample(points: Float32, options: CouplingOptions, rng: np.random.Generat
 
 def _couple(x: Float32, y: Float32, options: CouplingOptions) -> Coupling:
     for factor in (1.0, _RETRY_REG_FACTOR):
-        coupling = couple(
+        coupling = options.solve(
             x, y, reg=options.reg * factor, tolerance=options.tolerance,
             max_iterations=options.max_iterations,
         )  # fmt: skip

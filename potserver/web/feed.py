@@ -13,7 +13,7 @@ from potclient.client import MapClient
 from potclient.errors import UsageError
 from potclient.mesh import Mesh, mesh_of
 from potclient.occupancy import Grid
-from potclient.view.picture import TileIndex, tile_box, tiles_between
+from potclient.view.layers import TileIndex, tile_box, tiles_between
 from potclient.watched import WatchedCloud
 from potschemas import messages
 

@@ -7,6 +7,7 @@ import socket
 from collections.abc import Callable
 from typing import NamedTuple
 
+from potclient.extras import how_to_install
 from potschemas import messages
 from potserver.errors import SettingsError
 from potserver.log import get_logger
@@ -45,7 +46,7 @@ class WebListener:
             from potserver.web.pages import Pages
         except ImportError as error:
             raise SettingsError(
-                f"web.listen needs the packages of the extra `web`: pip install 'potserver[web]' ({error})"
+                f"web.listen needs the packages of the extra `web`: {how_to_install('web')} ({error})"
             ) from error
         host, port = host_and_port(address)
         try:

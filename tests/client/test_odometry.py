@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 
 from potclient.datasets import DatasetError, RecordedScan, open_dataset
+from tests.ros import messages
+from tests.ros.bags import writing
 
 
 @pytest.fixture(scope="module")
@@ -43,6 +45,22 @@ def test_odometry_places_a_drive_and_its_trajectory_plays_again(
     np.testing.assert_array_equal(placed[2].T_map_sensor, found[2], "a scan keeps its pose")
     again = open_dataset(drive, poses=tmp_path / "way.tum")
     np.testing.assert_allclose([scan.T_map_sensor for scan in again], found, atol=1e-6)
+
+
+def test_a_bag_without_poses_is_placed_as_the_folder_of_its_scans(
+    drive: Path, town: list[RecordedScan], tmp_path: Path
+) -> None:
+    with writing(tmp_path / "bag") as put:
+        for scan in town[:6]:
+            cloud = messages.cloud(messages.xyz_rows(scan.points[scan.is_return]), "lidar", scan.stamp_ns)
+            put("/points", cloud, scan.stamp_ns)
+    with pytest.raises(DatasetError, match="--odometry kiss-icp places 3D scans"):
+        open_dataset(tmp_path / "bag")
+    placed = open_dataset(tmp_path / "bag", odometry="kiss-icp", trajectory=tmp_path / "way.tum")
+    assert placed.notes[0] == "topic /points"
+    folder = [scan.T_map_sensor for scan in open_dataset(drive, odometry="kiss-icp")]
+    np.testing.assert_allclose([scan.T_map_sensor for scan in placed], folder, atol=1e-6)
+    assert len((tmp_path / "way.tum").read_text().splitlines()) == 6
 
 
 def test_later_scans_are_placed_after_all_before_them(drive: Path) -> None:

@@ -537,7 +537,7 @@ def test_pictures_of_towns_can_be_drawn(tmp_path: Path) -> None:
 def test_without_open3d_the_error_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "open3d", None)
     for name in ("town:terraces", "town:offices:2d"):
-        with pytest.raises(DatasetError, match=r"pip install 'potclient\[towns\]'"):
+        with pytest.raises(DatasetError, match=r"pip install 'potserver\[towns\]'"):
             open_dataset(name)
     assert Town("terraces").occupied([[0.0, 0.0, -1.0]])[0], "the truth needs no open3d"
 

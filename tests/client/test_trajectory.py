@@ -78,6 +78,38 @@ def test_vertices_of_graphs(tmp_path: Path) -> None:
         assert found.poses[0, :3, 3].tolist() == [1, 2, 3]
 
 
+def test_nclts_ground_truth_is_turned_to_z_up(tmp_path: Path) -> None:
+    """As the dataset has it: microseconds, north, east, down, and the turns of the body; the first lines are nan."""
+    at = 1_326_652_795_280_148
+    rows = ["nan, nan, nan, nan, nan, nan, nan", f"{at - 9000}, nan, nan, nan, nan, nan, nan"]
+    for i in range(3):
+        rows.append(f"{at + i * 1_000_000 - 500_000}, {10 + i}, 5, -0.5, 0.0, 0.1, {math.pi / 2}")
+    (tmp_path / "groundtruth.csv").write_text("\n".join([rows[1], rows[0], *rows[2:]]) + "\n")
+    points = np.array([[2.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 3.0, 0.0]])
+    records = np.zeros(3, [("xyz", "<u2", 3), ("intensity", "u1"), ("laser", "u1")])
+    records["xyz"] = np.round((points + 100) / 0.005)
+    scans = tmp_path / "velodyne_sync"
+    scans.mkdir()
+    for name in (at, at + 100_000):
+        (scans / f"{name}.bin").write_bytes(records.tobytes())
+    recording = open_dataset(scans, poses=tmp_path / "groundtruth.csv", layout="nclt", origin=(0, 0, -1.0))
+    assert "(NCLT, 2 of 5 lines have no numbers), at the stamps of the scans" in recording.notes[0]
+    first, second = recording
+    assert (first.stamp_ns, second.stamp_ns) == (at * 1000, at * 1000 + 10**8)
+    # it heads east with its nose .1 rad up: 2 m ahead is 2 cos .1 to the east and 2 sin .1 up; the scan is half way
+    north, west, up = 10.5, -5.0, 0.5
+    ahead = [north, west - 2 * math.cos(0.1), up + 2 * math.sin(0.1)]
+    below = [north, west - math.sin(0.1), up - math.cos(0.1)]
+    right = [north - 3, west, up]
+    np.testing.assert_allclose(first.in_map, [ahead, below, right], atol=0.003)
+    above = [north, west + math.sin(0.1), up + math.cos(0.1)]
+    np.testing.assert_allclose(first.T_map_sensor[:3, 3], above, atol=1e-9)
+    assert second.T_map_sensor[0, 3] == pytest.approx(10.6)
+    (tmp_path / "back.csv").write_text(f"{at}, 0, 0, 0, 0, 0, 0\n{at - 1}, 0, 0, 0, 0, 0, 0\n")
+    with pytest.raises(DatasetError, match="whose stamps grow"):
+        read_trajectory(tmp_path / "back.csv")
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [

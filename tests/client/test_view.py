@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from potclient.occupancy import Grid
-from potclient.view.picture import MapPicture, tile_box, tiles_between
+from potclient.view.layers import tile_box, tiles_between
+from potclient.view.picture import MapPicture
 
 pytest.importorskip("rerun")
 

@@ -68,10 +68,19 @@ def squared_distances(x: ArrayLike, y: ArrayLike) -> Float64:
 
 
 def sinkhorn_cost(x: ArrayLike, y: ArrayLike, reg: float) -> float:
-    """<P, D> of eq. 4 by POT in float64."""
+    """<P, D> of eq. 4 by POT in float64; without entropy at a reg of 0."""
+    if reg == 0.0:
+        return exact_plan(x, y)[1]
     cost = squared_distances(x, y)
     plan = ot.sinkhorn([], [], cost, reg, stopThr=1e-9, numItermax=20_000)
     return float((plan * cost).sum())
+
+
+def exact_plan(x: ArrayLike, y: ArrayLike) -> tuple[Float64, float]:
+    """Eq. 4 without entropy, and <P, D>, by POT's linear program."""
+    cost = squared_distances(x, y)
+    plan = ot.emd([], [], cost)
+    return plan, float((plan * cost).sum())
 
 
 def rotated(points: ArrayLike, angle_rad: float) -> Float64:

@@ -11,6 +11,7 @@ import pytest
 
 from potserver.domain.dictionary import AtomDictionary
 from potserver.domain.types import KernelSet, Scan, yaw_pose
+from potserver.mapping.dispersions import integrated_out
 from potserver.mapping.matching import Match
 from potserver.mapping.paper import PAPER
 from potserver.mapping.service import MappingService
@@ -63,18 +64,19 @@ def test_algorithm1_finds_the_atom_that_a_scan_was_made_from(dims: int, turn_deg
     assert served[0].converged
     truth = chosen.kernels.hinge_mean @ pose[:3, :3].T + pose[:3, 3]
     assert len(update.kernels) == len(truth)
-    order = np.argsort(update.kernels.weight_mean)
-    wanted = np.argsort(chosen.kernels.weight_mean)
-    off = np.linalg.norm(update.kernels.hinge_mean[order] - truth[wanted], axis=1)
+    distance = np.linalg.norm(update.kernels.hinge_mean[:, None] - truth, axis=2)
+    wanted, order = np.arange(len(truth)), distance.argmin(axis=0)
+    off = distance.min(axis=0)
     assert off.max() < 0.05, off.max()
-    # row C10: ten numbers a kernel go along, and the dispersion of the position turns with it
-    for name in ("gamma_shape", "gamma_rate", "weight_mean", "weight_var"):
-        np.testing.assert_array_equal(
-            getattr(update.kernels, name)[order], getattr(chosen.kernels, name)[wanted]
-        )
+    # row C10: ten numbers a kernel go along, the dispersion of the position turns with it, and dispersions enter the answers
     R = rotation_z(turn)
     turned = np.stack([np.diag(R @ np.diag(v) @ R.T) for v in chosen.kernels.hinge_var.astype(np.float64)])
     np.testing.assert_allclose(update.kernels.hinge_var[order], turned[wanted], rtol=1e-4)
+    told = integrated_out(chosen.kernels.replace(hinge_var=turned.astype(np.float32)), planar=dims == 2)
+    for name in ("gamma_shape", "gamma_rate", "weight_mean", "weight_var"):
+        np.testing.assert_allclose(
+            getattr(update.kernels, name)[order], getattr(told, name)[wanted], rtol=1e-5
+        )
     # the overall map is what was carried, no more and no less
     assert len(service.snapshot) == len(truth)
 
@@ -114,3 +116,11 @@ def test_the_default_profile_crops_to_the_sector() -> None:
     bearing = np.arctan2(carried.kernels.hinge_mean[:, 1], carried.kernels.hinge_mean[:, 0])
     assert 9 <= len(carried.kernels) <= 18
     assert np.abs(bearing).max() <= math.radians(36.0)
+
+
+def test_row_c10_transport_carries_all_ten_numbers() -> None:
+    atom = _atom(1, 3)
+    sector = reference.sector(atom.hit_points, atom.free_points)
+    carried = transport(Match(atom, 0.0, 0.0), sector, PAPER.coupling, seed=0)
+    for name in ("hinge_var", "gamma_shape", "gamma_rate", "weight_mean", "weight_var"):
+        np.testing.assert_array_equal(getattr(carried.kernels, name), getattr(atom.kernels, name))

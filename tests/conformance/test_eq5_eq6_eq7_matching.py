@@ -2,14 +2,23 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import numpy as np
 import pytest
 
+from potclient.datasets import open_dataset
 from potserver.domain.dictionary import AtomDictionary
 from potserver.mapping.matching import Matcher, Ranking, RankScore
+from potserver.mapping.paper import PAPER
+from potserver.mapping.sampling import BeamLimits, Draws, draw_beams
+from potserver.mapping.sectors import cut_sectors
+from potserver.mapping.settings import MappingSettings
+from potserver.numerics.beams import label_beams
+from potserver.numerics.coupling import couple
 from potserver.numerics.geometry import rotation_z
+from potserver.recordings import to_scan
 from tests.conformance import reference
 
 ROTATIONS_DEG = tuple(45.0 * k for k in range(-4, 4))
@@ -157,3 +166,63 @@ def test_row_c20_scale_does_matter_whatever_the_paper_says() -> None:
     assert same is not None
     assert larger is not None
     assert larger.w2_m2 > 1.2 * same.w2_m2
+
+
+def _sectors(dataset: str, numbers: list[int]) -> list:
+    """The sectors of some scans, as profile `paper` cuts them."""
+    recording, settings = open_dataset(dataset, max_range_m=20.0), MappingSettings.of_profile("paper")
+    found = []
+    for number in numbers:
+        scan, draws = to_scan(recording[number], number), Draws.of(0, number)
+        beams = draw_beams(scan, BeamLimits.of(settings), draws).learned
+        labelled = label_beams(beams, free_per_beam=2, gap_m=settings.free_gap_m, rng=draws.learn)
+        found += cut_sectors(labelled, scan.T_map_sensor, settings.max_range_m, PAPER.sectors)
+    return found
+
+
+def _few(thing, rng: np.random.Generator):
+    """An atom or a sector with no more points than the ranking looks at, so that it draws none of them."""
+    kept = {}
+    for name, n in (("hit_points", PAPER.ranking.n_hits), ("free_points", PAPER.ranking.n_free)):
+        points = getattr(thing, name)
+        kept[name] = points[rng.permutation(len(points))[:n]]
+    return dataclasses.replace(thing, **kept)
+
+
+def test_row_a8_the_blur_of_the_ranking_leaves_the_choice_of_exact_transport_in_2d() -> None:
+    """At the authors' reg of 12.5 m^2 some choices are others."""
+    rng = np.random.default_rng(0)
+    sectors = [_few(sector, rng) for sector in _sectors("town:terraces:2d:11", [0, 10])]
+    atoms = [_few(atom, rng) for atom in list(AtomDictionary.builtin().of_dims(2))[8:16]]
+    rotations = np.deg2rad(PAPER.ranking.rotations_deg)
+    found: dict[str, list[tuple[str, float]]] = {"exact": []}
+    for sector in sectors:
+        scores = reference.rank(atoms, rotations.tolist(), sector, 0.0).normalised
+        a, r = np.unravel_index(int(scores.argmin()), scores.shape)
+        found["exact"].append((atoms[a].atom_id, rotations[r]))
+    for name, ranking in (("ours", PAPER.ranking), ("theirs", PAPER.ranking._replace(reg_m2=12.5))):
+        matches = Matcher(AtomDictionary(tuple(atoms)), ranking, threads=2, seed=0).match(sectors)
+        found[name] = [(m.atom.atom_id, m.rotation_rad) for m in matches if m is not None]
+    assert found["ours"] == found["exact"]
+    assert sum(one != other for one, other in zip(found["theirs"], found["exact"], strict=True)) >= 1
+
+
+def test_row_c20_a_plan_without_entropy_depends_on_neither_shift_nor_scale_but_its_cost_does() -> None:
+    """The marginals fix |x|^2 and |y|^2 in the cost, so that only x.y chooses."""
+    rng = np.random.default_rng(10)
+    x, y = rng.normal(size=(2, 40, 3))
+    plan, cost = reference.exact_plan(x, y)
+    for scale, shift in ((3.0, [0.0] * 3), (1.0, [5.0, -7.0, 1.0]), (0.3, [2.0, 2.0, 0.0])):
+        other, other_cost = reference.exact_plan(x, scale * y + shift)
+        np.testing.assert_array_equal(other > 0, plan > 0)
+        assert other_cost != pytest.approx(cost, rel=0.05)
+
+
+def test_row_c20_entropy_ties_the_plan_to_scale_unless_it_grows_with_the_cost() -> None:
+    rng = np.random.default_rng(11)
+    x, y = rng.normal(size=(2, 60, 3)).astype(np.float32)
+    plan = couple(x, y, reg=0.01, tolerance=1e-5).plan
+    both = couple(10 * x, 10 * y, reg=0.01, tolerance=1e-5).plan
+    np.testing.assert_allclose(both, plan, atol=1e-5)
+    fixed = [couple(s * x, s * y, reg=0.1, relative=False, tolerance=1e-5).plan for s in (1, 3)]
+    assert np.abs(fixed[0] - fixed[1]).max() > 1e-3

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import json
 import os
 import select
@@ -75,6 +76,22 @@ class Browser:
             self.call(
                 "Input.dispatchMouseEvent", session=True, type=kind, x=x, y=y, button="left", clickCount=1
             )
+
+    def press(self, key: str, code: int) -> None:
+        """A key, by its name and its virtual code, where the focus is."""
+        for kind in ("rawKeyDown", "keyUp"):
+            self.call(
+                "Input.dispatchKeyEvent",
+                session=True,
+                type=kind,
+                key=key,
+                code=key,
+                windowsVirtualKeyCode=code,
+            )
+
+    def picture(self) -> bytes:
+        """A PNG of the page."""
+        return base64.b64decode(self.call("Page.captureScreenshot", session=True, format="png")["data"])
 
     def call(self, method: str, *, session: bool = False, **params: Any) -> Any:
         """The result of a command; events that come meanwhile are dropped."""

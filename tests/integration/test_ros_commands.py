@@ -140,7 +140,8 @@ def test_a_bag_maps_as_the_recording_that_it_was_made_of(
     ("flags", "message"),
     [
         (("--topic", "/nothing"), "no scans on /nothing; topics of PointCloud2, LaserScan: /points"),
-        (("--tf", "--poses", "/odom"), "poses come from one of the two"),
+        (("--tf", "--poses", "/odom"), "--tf and --poses: poses come from one of the two"),
+        (("--tf", "--odometry", "kiss-icp"), "--tf and --odometry: poses come from one of the two"),
         (("--tf", "nowhere"), "those above 'nowhere' are none"),
         (("--poses", "/odom"), "no poses on /odom"),
     ],

@@ -154,35 +154,104 @@ def test_what_is_wrong_is_said(served: MapServer, client: MapClient) -> None:
     assert refused(served, "point", x=1e9, y=0, z=0)[0] == 503, "the server refuses it"
 
 
-def test_a_browser_draws_the_map_and_a_click_asks_it(
-    served: MapServer, client: MapClient, tmp_path: Path
-) -> None:
+WIDTH, HEIGHT, PAGE_S = 800, 500, 120.0
+RIGHT_ARROW = ("ArrowRight", 39)
+INSIDE = ((170, 180), (250, 240))  # pixels where the slice is
+
+
+@pytest.fixture
+def browser(served: MapServer, client: MapClient, tmp_path: Path) -> Iterator[Browser]:
+    """A page that shows all tiles of the map, and the slice in the middle of it, which is easy to hit."""
     program = find_browser()
     if program is None:
         pytest.skip("no chromium here")
     assert served.web is not None
-    width, height = 800, 500
-
-    def answer_in(browser: Browser) -> Any:
-        text = browser.evaluate("document.body?.dataset.answer")
-        return None if text is None else json.loads(text)
-
-    with Browser(program, tmp_path, width, height, 120.0) as browser:
+    with Browser(program, tmp_path, WIDTH, HEIGHT, PAGE_S) as browser:
         browser.open(f"http://{served.web.address}/?ask=5.9,0.2,0.1")
-        asked = until(lambda: answer_in(browser), "the point of the address", 120.0)
-        assert asked["point"] == [5.9, 0.2, 0.1]
-        n_tiles = len(ask(served, "state")["tiles"])
-        assert browser.evaluate("document.body.dataset.tiles") == str(n_tiles) != "0"
+        until(lambda: answer_in(browser), "the point of the address", PAGE_S)
         browser.evaluate("document.getElementById('cut').click()")
-        until(lambda: browser.evaluate("document.body?.dataset.slices"), "the slice", 120.0)
-        browser.click(width // 3, height // 2)
-        clicked = until(
-            lambda: (a := answer_in(browser)) and a["point"] != asked["point"] and a, "the click", 120.0
-        )
-        shown = browser.evaluate("document.getElementById('answer').innerText")
+        until(lambda: told(browser, "slice"), "the slice", PAGE_S)
+        yield browser
+
+
+def told(browser: Browser, name: str) -> Any:
+    """What the page keeps for tests."""
+    text = browser.evaluate(f"document.body?.dataset.{name}")
+    return None if text is None else json.loads(text)
+
+
+def answer_in(browser: Browser) -> Any:
+    return told(browser, "answer")
+
+
+def answer_after(browser: Browser, *places: tuple[int, int]) -> Any:
+    """The answer that clicks at these pixels bring."""
+    before = answer_in(browser)
+    for place in places:
+        browser.click(*place)
+    return until(lambda: (a := answer_in(browser)) != before and a, "the answer to the clicks", PAGE_S)
+
+
+def choose(browser: Browser, tool: str) -> None:
+    browser.evaluate(f"document.querySelector('[value={tool}]').click()")
+
+
+def test_a_browser_draws_the_map_and_a_click_asks_it(
+    served: MapServer, client: MapClient, browser: Browser
+) -> None:
+    asked = answer_in(browser)
+    assert asked["point"] == [5.9, 0.2, 0.1]
+    n_tiles = len(ask(served, "state")["tiles"])
+    assert browser.evaluate("document.body.dataset.tiles") == str(n_tiles) != "0"
+    assert told(browser, "revision") == client.info().map_revision
+    clicked = answer_after(browser, INSIDE[0])
+    shown = browser.evaluate("document.getElementById('answer').innerText")
     for answer in (asked, clicked):
         expected = client.occupancy([answer["point"]])
         assert answer["mean"] == pytest.approx(float(expected.mean[0]), abs=1e-6)
         assert answer["sd"] == pytest.approx(float(np.sqrt(expected.var[0])), abs=1e-6)
         assert answer["observed"] == bool(expected.observed[0])
     assert f"{clicked['mean']:.4f}" in shown
+
+
+def test_two_clicks_of_the_ray_tool_are_a_ray(client: MapClient, browser: Browser) -> None:
+    choose(browser, "ray")
+    answer = answer_after(browser, *INSIDE)
+    start, way = np.array(answer["from"]), np.array(answer["to"]) - answer["from"]
+    reach_m = float(np.linalg.norm(way))
+    assert reach_m > 1.0
+    expected = client.rays([start], [way], reach_m)
+    assert answer["reach_m"] == pytest.approx(reach_m)
+    assert answer["mean_m"] == pytest.approx(float(expected.mean_m[0]), abs=1e-4)
+    assert answer["sd_m"] == pytest.approx(float(expected.std_m[0]), abs=1e-4)
+    assert answer["hit_probability"] == pytest.approx(float(expected.hit_probability[0]), abs=1e-5)
+    shown = browser.evaluate("document.getElementById('answer').innerText")
+    assert f"{answer['mean_m']:.2f} of {reach_m:.2f} m" in shown
+
+
+def test_two_clicks_of_the_risk_tool_are_a_way_of_a_ball(client: MapClient, browser: Browser) -> None:
+    browser.evaluate("document.getElementById('radius').value = 0.4")
+    choose(browser, "risk")
+    answer = answer_after(browser, *INSIDE)
+    assert answer["radius"] == 0.4
+    n_poses = 2 + int(answer["length_m"] / 0.2)
+    way = np.tile(np.eye(4), (n_poses, 1, 1))
+    way[:, :3, 3] = np.linspace(answer["from"], answer["to"], n_poses)
+    expected = client.risk(way, [[0, 0, 0, 0.4]], unknown="prior")
+    assert answer["max"] == pytest.approx(expected.path_max_probability, abs=1e-6)
+    assert answer["union"] == pytest.approx(expected.path_union_probability, abs=1e-6)
+    shown = browser.evaluate("document.getElementById('answer').innerText")
+    assert f"{answer['union']:.4f}" in shown
+
+
+def test_the_slider_moves_the_slice(served: MapServer, client: MapClient, browser: Browser) -> None:
+    first = told(browser, "slice")
+    browser.evaluate("document.getElementById('z').focus()")
+    browser.press(*RIGHT_ARROW)
+    second = until(lambda: (s := told(browser, "slice"))["z"] != first["z"] and s, "the next slice", PAGE_S)
+    assert second["z"] == pytest.approx(first["z"] + 0.05)
+    assert browser.evaluate("document.getElementById('height').innerText") == f"{second['z']:.2f}"
+    for shown in (first, second):
+        data = fetch(served, "api/slice", z=shown["z"])  # proved against `occupancy` above
+        assert shown["shape"] == np.frombuffer(data, "<u4", 2).tolist()
+        assert shown["sum"] == np.frombuffer(data, np.uint8, offset=20).sum(dtype=int)

@@ -9,10 +9,9 @@ import pytest
 
 from potschemas.answers import PRIOR_VAR
 from potserver.domain.dictionary import AtomDictionary
-from potserver.domain.tiles import CARRIED, COARSE, FINE, TiledMap
+from potserver.domain.tiles import COARSE, FINE, TiledMap
 from potserver.domain.types import Scan, yaw_pose
 from potserver.errors import SettingsError, SolverError
-from potserver.evaluation.ablations import ABLATIONS
 from potserver.mapping import fusion
 from potserver.mapping.fusion import grid_for
 from potserver.mapping.service import MappingService
@@ -241,18 +240,13 @@ def test_a_range_beyond_the_voxels_is_refused() -> None:
     assert service.n_scans == 0
 
 
-def test_transported_kernels_join_the_map_only_when_asked_to() -> None:
-    plain = _service(None)
-    carrying = MappingService(threads=2, make_pipeline=ABLATIONS["RePOT, transported prior"])
-    updates = [s.integrate(_scan(0)) for s in (plain, carrying)]
-    assert all(len(update.kernels) for update in updates)
-    assert updates[0].n_kernels_transported == 0
-    assert 0 < updates[1].n_kernels_transported < updates[1].n_kernels_added == len(carrying.snapshot)
-    levels = np.concatenate([tile.kernels.level for tile in _tiled(carrying).tiles.values()])
-    assert (levels == CARRIED).sum() == updates[1].n_kernels_transported
-    assert {COARSE, FINE} <= set(levels.tolist())
-    again = [carrying.integrate(_scan(1)).n_kernels_transported for _ in range(5)]
-    assert max(again[-2:]) < updates[1].n_kernels_transported, "what atoms explain needs no other atom"
+def test_no_transported_kernel_joins_the_map() -> None:
+    service = _service(None)
+    update = service.integrate(_scan(0))
+    assert len(update.kernels)
+    assert update.n_kernels_transported == 0
+    levels = np.concatenate([tile.kernels.level for tile in _tiled(service).tiles.values()])
+    assert set(levels.tolist()) == {COARSE, FINE}
 
 
 def test_priors_are_never_what_a_fit_returned() -> None:

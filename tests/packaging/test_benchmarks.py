@@ -12,7 +12,6 @@ import pytest
 @pytest.mark.parametrize(
     "name",
     [
-        "equal_time",
         "fairness",
         "ghosts",
         "kill",

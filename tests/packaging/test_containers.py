@@ -86,7 +86,7 @@ def test_the_base_image_is_pinned(dockerfile: Path) -> None:
     assert re.fullmatch(r"BASE=python:3\.\d+(\.\d+)?-slim-\w+(@sha256:[0-9a-f]{64})?", base), base
 
 
-def test_packages_are_pinned_by_hash_but_for_torch_and_ourselves(dockerfile: Path) -> None:
+def test_packages_are_pinned_by_hash(dockerfile: Path) -> None:
     installs = [
         command
         for word, rest in instructions(dockerfile)
@@ -99,17 +99,10 @@ def test_packages_are_pinned_by_hash_but_for_torch_and_ourselves(dockerfile: Pat
         if "--no-deps --require-hashes -r locks/" in command
         else "ours"
         if command.endswith("--no-deps /dist/*.whl")
-        else "torch"
-        if command.endswith("-c constraints.txt torch")
         else command
         for command in installs
     ]
-    wanted = (
-        ["hashed", "hashed", "torch", "ours"]
-        if dockerfile.name.startswith("server")
-        else ["hashed", "hashed", "ours"]
-    )
-    assert kinds == wanted
+    assert kinds == ["hashed", "hashed", "ours"]
 
 
 def test_every_image_carries_a_bill_of_materials(dockerfile: Path) -> None:

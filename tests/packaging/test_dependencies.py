@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import importlib.metadata
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -87,14 +88,14 @@ def test_the_client_declares_nothing_that_it_does_not_use(root: Path, client_pro
 def test_the_server_imports_only_what_it_declares(root: Path, project: dict) -> None:
     allowed = names(requirements(project))
     found = distributions_imported(root / "potserver")
-    of_web = names(requirements(project, "web"))
-    assert {name: file for name, file in found.items() if name not in allowed | of_web} == {}
+    of_extras = names(requirements(project, "learn", "web"))
+    assert {name: file for name, file in found.items() if name not in allowed | of_extras} == {}
 
 
 def test_the_server_loads_with_no_extra_installed() -> None:
     program = """
 import sys
-sys.modules |= dict.fromkeys(("starlette", "uvicorn", "prometheus_client"))
+sys.modules |= dict.fromkeys(("starlette", "uvicorn", "prometheus_client", "torch", "open3d"))
 import potserver.server, potserver.cli
 """
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120)
@@ -106,6 +107,21 @@ def test_the_client_needs_nothing_that_the_server_does_not(project: dict, client
         theirs = {str(requirement) for requirement in requirements(client_project, extra)}
         ours = [extra] if extra in project["optional-dependencies"] else []
         assert theirs <= {str(requirement) for requirement in requirements(project, *ours)}, extra
+
+
+def test_extras_that_are_named_where_a_package_is_missing_exist(
+    root: Path, project: dict, client_project: dict
+) -> None:
+    """What a robot's program asks for, both wheels have; what the server's does, the server's has."""
+    theirs = set(client_project["optional-dependencies"])
+    ours = set(project["optional-dependencies"])
+    n_named = 0
+    for folder, known in ((root / "clients", ours & theirs), (root / "potserver", ours)):
+        for path in folder.rglob("*.py"):
+            named = set(re.findall(r"how_to_install\('(\w+)'\)", path.read_text()))
+            assert named <= known, path
+            n_named += len(named)
+    assert n_named > 8
 
 
 @pytest.mark.parametrize("python", PYTHONS)

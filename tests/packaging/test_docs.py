@@ -32,7 +32,7 @@ class Block(NamedTuple):
 
 
 def documents(root: Path) -> list[Path]:
-    names = ("docs", "docs/decisions", "schemas", "benchmarks", "clients", "docker", ".github")
+    names = ("docs", "docs/decisions", "docs/guides", "schemas", "benchmarks", "clients", "docker", ".github")
     folders = (root, *(root / name for name in names))
     return sorted(path for folder in folders for path in folder.glob("*.md"))
 
@@ -154,8 +154,14 @@ def test_every_figure_with_a_script_has_been_drawn(root: Path) -> None:
     assert {path.stem for path in (root / "docs/pictures").glob("*.py")} == drawn
 
 
-def test_the_moving_picture_is_small_enough_to_load(root: Path) -> None:
-    path = root / "docs/pictures/growing_map.gif"
+def test_the_page_moves_on_the_readmes_first_screen(root: Path) -> None:
+    first_screen = (root / "README.md").read_text().partition("\n## ")[0]
+    assert "](docs/pictures/page.gif)" in first_screen
+
+
+@pytest.mark.parametrize("name", ["page.gif", "growing_map.gif"])
+def test_moving_pictures_are_small_enough_to_load(root: Path, name: str) -> None:
+    path = root / "docs/pictures" / name
     assert path.stat().st_size <= 2_000_000
     with Image.open(path) as picture:
         assert picture.n_frames > 5

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import shlex
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -64,3 +67,33 @@ def test_the_client_wheel_works_alone(client_venv) -> None:
     done = client_venv.run("potclient", "--help")
     assert (done.returncode, done.stderr) == (0, "")
     assert not (client_venv.folder / "bin" / "potserver").exists()
+
+
+@pytest.mark.parametrize(
+    ("which", "extras"),
+    [
+        ("full_venv", ["ros", "view", "web", "odometry", "learn", "towns", "mesh", "files"]),
+        ("client_venv", ["ros", "view"]),
+    ],
+)
+def test_the_command_that_is_named_for_a_missing_package_works_before_a_release(
+    which: str, extras: list[str], request: pytest.FixtureRequest
+) -> None:
+    """Without an index: pip knows what an extra needs from the wheel that is installed. Here all of it is there."""
+    venv = request.getfixturevalue(which)
+    told = venv.run(
+        "python", "-c", f"from potclient.extras import how_to_install as h; print(h({','.join(extras)!r}))"
+    )
+    program, verb, wanted = shlex.split(told.stdout)
+    assert (program, verb) == ("pip", "install")
+    pip = [sys.executable, "-m", "pip", "--python", str(venv.folder / "bin" / "python")]
+    done = subprocess.run(
+        [*pip, verb, "--no-index", "--dry-run", wanted],
+        capture_output=True,
+        text=True,
+        timeout=240,
+        cwd=venv.folder,
+    )
+    assert done.returncode == 0, done.stderr
+    distribution = wanted.partition("[")[0]
+    assert f"{distribution} 0" not in done.stderr, "no extra that the wheel does not have"

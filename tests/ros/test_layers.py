@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 
 from potclient.errors import UsageError
 from potclient.occupancy import Grid, Occupancy
+from potclient.questions.tiles import MIRROR_MARGIN_M
 from potserver.config import load_settings
 from potserver.ros import grid_layer
 from potserver.ros.changes import Change
@@ -140,6 +141,22 @@ def test_surface_points_lie_on_the_surface() -> None:
     assert len(distance) > 200
     assert np.abs(distance - 2.0).max() < 0.02
     assert np.allclose(voxels.surface.sd, 0.5, atol=0.01)
+
+
+def test_only_the_changed_tiles_and_their_reach_are_asked_again() -> None:
+    source = FormulaMap((-59.9, -59.9, -9.9), (59.9, 59.9, 9.9), ball((0, 0, 0)))
+    layers_of_it = layers(source, grid_m=1.0, voxel_m=1.0)
+    for layer in layers_of_it:
+        layer.update(ANYTHING)
+    tile = Change(frozenset({(3, -2, 0)}), TILE_M)
+    reach_m = MIRROR_MARGIN_M + 1.0  # a cell more: boxes are of whole cells
+    for layer in layers_of_it:
+        source.asked.clear()
+        layer.update(tile)
+        assert source.asked
+        for lower, upper in source.asked:
+            assert np.all(np.array(lower)[:2] >= np.array([30, -20]) - reach_m)
+            assert np.all(np.array(upper)[:2] <= np.array([40, -10]) + reach_m)
 
 
 @settings(max_examples=10)

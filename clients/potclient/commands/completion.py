@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from potclient.errors import UsageError
+from potclient.extras import how_to_install
 
 SHELLS = ("bash", "zsh", "tcsh")
 _FILES = ("FILE", "FILE|DIR", "DATASET")
@@ -31,9 +32,7 @@ class PrintCompletion(argparse.Action):
         try:
             import shtab
         except ImportError as error:
-            raise UsageError(
-                "completion needs the package shtab: pip install 'potserver[completion]'"
-            ) from error
+            raise UsageError(f"completion needs the package shtab: {how_to_install('completion')}") from error
         for action in _actions(parser):
             if action.choices is None and action.metavar in (*_FILES, *_FOLDERS):
                 completes: Any = shtab.FILE if action.metavar in _FILES else shtab.DIRECTORY

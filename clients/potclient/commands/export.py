@@ -14,7 +14,7 @@ def add(commands: Any) -> None:
         commands,
         "export",
         run,
-        help="the map as a file of another program: ply, npz, pgm, bt, mesh, gltf, rrd",
+        help="the map as a file of another program: ply, npz, pgm, bt, mesh, gltf, rrd, mcap",
         description="""Write the map as a file that other programs read. Maps larger than one answer are fetched part by part.
 
   ply   kernels, all ten numbers of each, coloured by what they say
@@ -24,14 +24,16 @@ def add(commands: Any) -> None:
   mesh  the surface where the probability is one half, as a PLY of triangles coloured by its standard deviation
   gltf  the same as binary glTF (.glb), whose y axis is up
   rrd   the surface, free space and the edge of the unknown as a recording of Rerun; `potclient view` follows a map
+  mcap  the same points as ROS 2 messages, for Foxglove and RViz: PointCloud2, and an OccupancyGrid if heights are given
 
-For pgm, --above-ground says which heights above the ground matter to the robot, and --band which heights of the map frame.
-A planar map is one layer and needs neither.""",
+For pgm and mcap, --above-ground says which heights above the ground matter to the robot, and --band which heights of the
+map frame. A planar map is one layer and needs neither.""",
         epilog="""examples:
   potclient export ply -o kernels.ply
   potclient export pgm --resolution 0.05 --above-ground 0.15 1.5 -o map.pgm
   potclient export bt --resolution 0.2 --lower -20 -20 -1 --upper 20 20 4 -o map.bt
-  potclient export gltf --resolution 0.2 -o map.glb""",
+  potclient export gltf --resolution 0.2 -o map.glb
+  potclient export mcap --resolution 0.2 --above-ground 0.15 1.5 -o map.mcap""",
     )
     parser.add_argument("kind", choices=EXPORT_KINDS)
     add_export_flags(parser)

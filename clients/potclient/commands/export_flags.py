@@ -17,7 +17,7 @@ from potclient.errors import UsageError
 from potclient.ground import estimate_ground
 from potclient.mesh import export_mesh
 
-EXPORT_KINDS = ("ply", "npz", "pgm", "bt", "mesh", "gltf", "rrd")
+EXPORT_KINDS = ("ply", "npz", "pgm", "bt", "mesh", "gltf", "rrd", "mcap")
 _WHAT = {
     "ply": "kernels",
     "npz": "kernels",
@@ -26,9 +26,11 @@ _WHAT = {
     "mesh": "triangles",
     "gltf": "triangles",
     "rrd": "tiles",
+    "mcap": "tiles",
 }
-_ENDINGS = {"mesh": ".ply", "gltf": ".glb", "rrd": ".rrd"}
-_GRID_KINDS = ("pgm", "bt", "mesh", "gltf", "rrd")
+_ENDINGS = {"mesh": ".ply", "gltf": ".glb", "rrd": ".rrd", "mcap": ".mcap"}
+_GRID_KINDS = ("pgm", "bt", "mesh", "gltf", "rrd", "mcap")
+_FLAT_KINDS = ("pgm", "mcap")  # with the map seen from above
 _TOUCHES_M, _TOUCHES_SHARE = (
     0.1,
     0.05,
@@ -44,14 +46,18 @@ def add_export_flags(parser: argparse.ArgumentParser) -> None:
     )
     heights = parser.add_mutually_exclusive_group()
     heights.add_argument(
-        "--band", type=float, nargs=2, metavar=("LOW", "HIGH"), help="pgm: heights that count, m, map frame"
+        "--band",
+        type=float,
+        nargs=2,
+        metavar=("LOW", "HIGH"),
+        help="pgm, mcap: heights that count, m, map frame",
     )
     heights.add_argument(
         "--above-ground",
         type=float,
         nargs=2,
         metavar=("LOW", "HIGH"),
-        help="pgm: heights that count, m above the ground below each pixel, which is estimated",
+        help="pgm, mcap: heights that count, m above the ground below each pixel, which is estimated",
     )
     parser.add_argument(
         "--occupied", type=float, metavar="P", help="occupied from here on (default: pgm 0.65, bt 0.5)"
@@ -74,22 +80,22 @@ def check_export_flags(arguments: argparse.Namespace) -> None:
     grid_flags = (arguments.resolution, *heights, *thresholds)
     if kind not in _GRID_KINDS and any(flag is not None for flag in grid_flags):
         raise UsageError(f"export {kind}: kernels have no cells; only --lower and --upper apply")
-    if kind != "pgm" and any(flag is not None for flag in heights):
+    if kind not in _FLAT_KINDS and any(flag is not None for flag in heights):
         raise UsageError(
-            f"export {kind}: --band and --above-ground are for pgm; give the heights with --lower and --upper"
+            f"export {kind}: --band and --above-ground are for pgm and mcap; give the heights with --lower and --upper"
         )
-    if kind in ("mesh", "gltf", "rrd"):
+    if kind in _ENDINGS:
         if any(flag is not None for flag in thresholds):
             raise UsageError(
                 f"export {kind}: the surface is where p is one half; leave out --occupied and --free"
             )
         if arguments.out.suffix != _ENDINGS[kind]:
             raise UsageError(f"{arguments.out}: export {kind} writes {_ENDINGS[kind]}")
-    if kind == "rrd" and (arguments.lower is not None or arguments.upper is not None):
-        raise UsageError("export rrd: it draws whole tiles; leave out --lower and --upper")
+    if kind in ("rrd", "mcap") and (arguments.lower is not None or arguments.upper is not None):
+        raise UsageError(f"export {kind}: it draws whole tiles; leave out --lower and --upper")
     for name, band in (("--band", arguments.band), ("--above-ground", arguments.above_ground)):
         if band is not None and not band[0] < band[1]:
-            raise UsageError(f"export pgm: {name} {band[0]:g} {band[1]:g}: need LOW below HIGH")
+            raise UsageError(f"export {kind}: {name} {band[0]:g} {band[1]:g}: need LOW below HIGH")
 
 
 def export_map(source: MapSource, arguments: argparse.Namespace) -> int:
@@ -105,6 +111,8 @@ def export_map(source: MapSource, arguments: argparse.Namespace) -> int:
             done = export.Exported(*export_mesh(source, arguments.out, box, arguments.kind, progress))
         elif arguments.kind == "rrd":
             done = _export_rrd(source, arguments, progress)
+        elif arguments.kind == "mcap":
+            done = _export_mcap(source, arguments, progress)
         else:
             write = export.export_ply if arguments.kind == "ply" else export.export_npz
             done = write(
@@ -137,9 +145,47 @@ def _export_rrd(
     return export.Exported(n_tiles, tuple(sorted({revision, source.info().map_revision})))
 
 
+def _export_mcap(
+    source: MapSource, arguments: argparse.Namespace, progress: Progress | None
+) -> export.Exported:
+    from potclient.ros.maps import percent
+    from potclient.view.bag import BagPicture
+    from potclient.view.live import draw_map
+
+    seen_from_above = (
+        layer_of(source) is not None or arguments.band is not None or arguments.above_ground is not None
+    )
+    revision, picture = source.info().map_revision, BagPicture(arguments.out)
+    try:
+        n_tiles = draw_map(source, picture, arguments.resolution, progress)
+        if seen_from_above:
+            box, band = _columns(source, arguments, progress)
+            likeliest, _ = export.likeliest_of_columns(source, box, band, progress)
+            x, y = (box.first[:2] * box.resolution).tolist()
+            picture.draw_grid(percent(likeliest), (x, y), box.resolution)
+        picture.close()
+    finally:
+        picture.discard()
+    return export.Exported(n_tiles, tuple(sorted({revision, source.info().map_revision})))
+
+
 def _export_pgm(
     source: MapSource, arguments: argparse.Namespace, progress: Progress | None
 ) -> export.Exported:
+    box, band = _columns(source, arguments, progress)
+    return export.export_pgm(
+        source, arguments.out, box, band=band, progress=progress, **_thresholds(arguments)
+    )
+
+
+def _columns(
+    source: MapSource, arguments: argparse.Namespace, progress: Progress | None
+) -> tuple[CellBox, export.Band | None]:
+    """The columns of cells that the flags name, with the heights that count.
+
+    Raises:
+        UsageError: they leave out all of the map, or do not say which heights matter.
+    """
     (x, y, z), (x2, y2, z2) = _corners(source, arguments)
     layer, band = layer_of(source), None
     if layer is not None:
@@ -158,10 +204,7 @@ def _export_pgm(
             f"export pgm: the map spans {z:g} to {z2:g} m in height; say which matter to the robot, with"
             " --above-ground LOW HIGH, or with --band LOW HIGH in the map frame"
         )
-    box = CellBox.around((x, y, z), (x2, y2, z2), arguments.resolution)
-    return export.export_pgm(
-        source, arguments.out, box, band=band, progress=progress, **_thresholds(arguments)
-    )
+    return CellBox.around((x, y, z), (x2, y2, z2), arguments.resolution), band
 
 
 def _planar_heights(arguments: argparse.Namespace, layer: float, z: float, z2: float) -> tuple[float, float]:
@@ -171,11 +214,13 @@ def _planar_heights(arguments: argparse.Namespace, layer: float, z: float, z2: f
         UsageError: the flags leave it out, or ask for its ground.
     """
     if arguments.above_ground is not None:
-        raise UsageError("export pgm: this map is planar and has no ground; leave out --above-ground")
+        raise UsageError(
+            f"export {arguments.kind}: this map is planar and has no ground; leave out --above-ground"
+        )
     low, high = arguments.band if arguments.band is not None else (z, z2)
     if not low - 1e-6 <= layer <= high + 1e-6:
         raise UsageError(
-            f"export pgm: this map is planar, at {layer:.3g} m: {low:g} to {high:g} m leave it out"
+            f"export {arguments.kind}: this map is planar, at {layer:.3g} m: {low:g} to {high:g} m leave it out"
         )
     return layer, layer
 

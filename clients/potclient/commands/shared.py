@@ -17,8 +17,17 @@ import numpy as np
 from potclient.arrays import Float64
 from potclient.client import MapClient
 from potclient.commands.output_files import output_file, text_file
-from potclient.datasets import FORMATS, FRAMES, LAYOUTS, ODOMETRIES, Recording, open_dataset
-from potclient.datasets.bags import is_bag, open_bag
+from potclient.datasets import (
+    FORMATS,
+    FRAMES,
+    LAYOUTS,
+    ODOMETRIES,
+    Reading,
+    Recording,
+    open_dataset,
+    recording_of_bag,
+)
+from potclient.datasets.bags import is_bag
 from potclient.errors import UsageError
 from potclient.feed import FeedOptions
 from potclient.session import add_zenoh_arguments, options_from_arguments
@@ -154,7 +163,7 @@ def _add_placing(group: Any) -> None:
     group.add_argument(
         "--odometry",
         choices=ODOMETRIES,
-        help="let LiDAR odometry place the scans of a folder without poses; it closes no loops",
+        help="let LiDAR odometry place the scans of a folder or bag without poses; it closes no loops",
     )
     group.add_argument(
         "--trajectory",
@@ -224,16 +233,17 @@ def _open(arguments: argparse.Namespace) -> Recording:
         raise UsageError(
             f"{path}: --topic and --tf are for bags: a .mcap, .db3 or .bag file, or a rosbag2 folder"
         )
-    if arguments.tf is not None and arguments.poses is not None:
-        raise UsageError("--tf and --poses: poses come from one of the two")
-    return open_bag(
-        path,
-        topic=arguments.topic,
+    for flag, other in (("--poses", arguments.poses), ("--odometry", arguments.odometry)):
+        if arguments.tf is not None and other is not None:
+            raise UsageError(f"--tf and {flag}: poses come from one of the two")
+    how = Reading(
         poses=arguments.poses,
-        frame=arguments.tf or None,
+        odometry=arguments.odometry,
+        trajectory=_trajectory_of(arguments),
         min_range_m=arguments.min_range,
         max_range_m=arguments.max_range,
     )
+    return recording_of_bag(path, how, topic=arguments.topic, frame=arguments.tf or None)
 
 
 @contextlib.contextmanager

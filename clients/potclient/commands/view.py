@@ -6,11 +6,15 @@ import argparse
 import contextlib
 import threading
 from collections.abc import Iterator
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from potclient.commands.output_files import output_file
 from potclient.commands.shared import EXIT_OK, add_command, client_of, note, positive, say
 from potclient.errors import UsageError
+
+if TYPE_CHECKING:
+    from potclient.view.bag import BagPicture
+    from potclient.view.picture import MapPicture
 
 _RESOLUTION_M = 0.25
 _WEB_PORT, _STREAM_PORT = 9090, 9876
@@ -32,11 +36,17 @@ Rerun's viewer opens on this machine. It ends with ctrl-c, or after --seconds.""
   potclient view                                  Rerun's viewer on this machine
   potclient view --web 9090                       for a browser on this machine
   potclient view --save drive.rrd --seconds 60    a recording; `rerun drive.rrd` opens it
+  potclient view --save drive.mcap                scans, poses and surfaces as ROS 2 messages, for Foxglove
   potclient export rrd -o map.rrd --resolution 0.2   the map as it is, without following it""",
         timeout_s=60.0,
     )
     where = parser.add_mutually_exclusive_group()
-    where.add_argument("--save", type=output_file, metavar="FILE", help="write a recording (.rrd) instead")
+    where.add_argument(
+        "--save",
+        type=output_file,
+        metavar="FILE",
+        help="write a recording instead: .rrd, or .mcap with ROS 2 messages",
+    )
     where.add_argument(
         "--web",
         type=int,
@@ -64,15 +74,12 @@ Rerun's viewer opens on this machine. It ends with ctrl-c, or after --seconds.""
 
 def run(arguments: argparse.Namespace) -> int:
     from potclient.view.live import LiveView
-    from potclient.view.picture import MapPicture
 
-    if arguments.save is not None and arguments.save.suffix != ".rrd":
-        raise UsageError(f"{arguments.save}: a recording of Rerun ends in .rrd")
+    if arguments.save is not None and arguments.save.suffix not in (".rrd", ".mcap"):
+        raise UsageError(f"{arguments.save}: a recording ends in .rrd (Rerun) or .mcap (ROS 2 messages)")
     with client_of(arguments) as client:
         server = client.wait_ready()
-        picture = MapPicture(f"map {arguments.map} of {server}")
-        with contextlib.closing(picture):
-            _open(picture, arguments)
+        with contextlib.closing(_picture(arguments, f"map {arguments.map} of {server}")) as picture:
             view = LiveView(client, picture, arguments.resolution)
             with _ending(arguments.seconds) as end, contextlib.suppress(KeyboardInterrupt):
                 view.run(end)
@@ -82,7 +89,16 @@ def run(arguments: argparse.Namespace) -> int:
     return EXIT_OK
 
 
-def _open(picture: Any, arguments: argparse.Namespace) -> None:
+def _picture(arguments: argparse.Namespace, name: str) -> BagPicture | MapPicture:
+    """What is drawn on, open."""
+    if arguments.save is not None and arguments.save.suffix == ".mcap":
+        from potclient.view.bag import BagPicture
+
+        note(f"recording to {arguments.save}, which is there at the end")
+        return BagPicture(arguments.save)
+    from potclient.view.picture import MapPicture
+
+    picture = MapPicture(name)
     if arguments.save is not None:
         picture.save(arguments.save)
         note(f"recording to {arguments.save}")
@@ -90,6 +106,7 @@ def _open(picture: Any, arguments: argparse.Namespace) -> None:
         note(f"open {picture.serve(arguments.web, arguments.stream_port)}")
     else:
         picture.show()
+    return picture
 
 
 @contextlib.contextmanager

@@ -35,6 +35,7 @@ __all__ = [
     "RecordedScan",
     "Recording",
     "open_dataset",
+    "recording_of_bag",
 ]
 
 FORMATS = ("auto", *FOLDER_FORMATS, "carmen", "generated", "town", "gauntlet", "bag")
@@ -101,9 +102,7 @@ def open_dataset(
     if format == "auto":
         format, path = ("bag", path) if is_bag(path) else sniff(path)  # noqa: A001
     if format == "bag":
-        _refuse_odometry(how, str(path))
-        topic = None if how.poses is None else str(how.poses)
-        return open_bag(path, poses=topic, min_range_m=how.min_range_m, max_range_m=how.max_range_m)
+        return recording_of_bag(path, how)
     if format == "carmen":
         return _carmen(path, how)
     recording = open_folder(
@@ -116,11 +115,30 @@ def open_dataset(
         needs_poses=how.odometry is None,
     )
     note = not_read(path, recording.used)
-    if how.odometry is not None:
-        check_installed()
-        recording = OdometryRecording(recording, None if how.trajectory is None else Path(how.trajectory))
+    recording = _placed(recording, how)
     recording.notes = (*recording.notes, *note)
     return _limited(recording, how)
+
+
+def recording_of_bag(
+    path: Path, how: Reading, *, topic: str | None = None, frame: str | None = None
+) -> Recording:
+    """The scans of a bag, see `open_bag`; `how.poses` names a topic.
+
+    Raises:
+        DatasetError, UsageError: see `open_bag`.
+    """
+    poses = None if how.poses is None else str(how.poses)
+    found = open_bag(path, topic=topic, poses=poses, frame=frame, needs_poses=how.odometry is None)
+    return _limited(_placed(found, how), how)
+
+
+def _placed(recording: Recording, how: Reading) -> Recording:
+    """The recording, or what odometry makes of it."""
+    if how.odometry is None:
+        return recording
+    check_installed()
+    return OdometryRecording(recording, None if how.trajectory is None else Path(how.trajectory))
 
 
 def _made_up(text: str, format: str, how: Reading) -> Recording | None:  # noqa: A002
@@ -158,7 +176,9 @@ def _limited(recording: Recording, how: Reading) -> Recording:
 
 def _refuse_odometry(how: Reading, name: str) -> None:
     if how.odometry is not None:
-        raise DatasetError(f"{name}: odometry is for folders of 3D clouds; this recording brings its poses")
+        raise DatasetError(
+            f"{name}: odometry is for 3D clouds of files and bags; this recording brings its poses"
+        )
 
 
 def _generated(text: str, n_scans: int) -> Recording:

@@ -60,6 +60,7 @@ def open_bag(
     frame: str | None = None,
     min_range_m: float = 0.0,
     max_range_m: float | None = None,
+    needs_poses: bool = True,
 ) -> Recording:
     """The scans of one topic of a bag.
 
@@ -70,11 +71,12 @@ def open_bag(
         frame: The map's frame in `/tf`; None: the topmost above the first scan's.
         min_range_m: Points nearer than this are dropped.
         max_range_m: Beams beyond this are cut: free up to there, no echo.
+        needs_poses: False: somebody else places the scans, which all come with the pose of the origin.
     Raises:
         DatasetError: no such topic, no poses, or a damaged bag.
         UsageError: the package rosbags is not installed.
     """
-    bag = BagRecording(path, topic=topic, poses=poses, frame=frame)
+    bag = BagRecording(path, topic=topic, poses=poses, frame=frame, needs_poses=needs_poses)
     return RangeLimited(bag, min_range_m=min_range_m, max_range_m=max_range_m)
 
 
@@ -83,7 +85,9 @@ class BagRecording(Recording):
 
     format = "bag"
 
-    def __init__(self, path: Path, *, topic: str | None, poses: str | None, frame: str | None) -> None:
+    def __init__(
+        self, path: Path, *, topic: str | None, poses: str | None, frame: str | None, needs_poses: bool = True
+    ) -> None:
         super().__init__(path)
         self._reader = _open(path)
         weakref.finalize(self, self._reader.close)
@@ -94,10 +98,15 @@ class BagRecording(Recording):
         entries = self._index(poses)
         if not entries:
             raise DatasetError(f"{path}: no message on {self._topic}")
+        self._scans: list[tuple[_Entry, Float64]] = []
+        if not needs_poses:
+            self.notes = (f"topic {self._topic}",)
+            self._scans = [(entry, np.eye(4)) for entry in entries]
+            self._stamps = growing([entry.stamp_ns for entry in entries])
+            return
         if self._poses is None and len(self._tree) == 0:
             raise DatasetError(f"{path}: nothing on /tf and /tf_static, so no poses; {self._poses_hint()}")
         self._frame = self._tree.root_of(entries[0].frame_id) if frame is None else frame_of(frame)
-        self._scans: list[tuple[_Entry, Float64]] = []
         self._place(entries)
         self._stamps = growing([entry.stamp_ns for entry, _ in self._scans])
 
@@ -206,7 +215,8 @@ class BagRecording(Recording):
         found = sorted(c.topic for c in self._reader.connections if c.msgtype in _POSES)
         if found:
             return f"topics with poses: {', '.join(found)}; try --poses {found[0]}"
-        return f"no topic of Odometry or PoseStamped either; topics: {_topics(self._reader)}"
+        none = f"no topic of Odometry or PoseStamped either; topics: {_topics(self._reader)}"
+        return f"{none}; --odometry kiss-icp places 3D scans"
 
 
 def _open(path: Path) -> Any:

@@ -14,6 +14,7 @@ from potclient.arrays import Float64
 from potclient.datasets.scans import RecordedScan, Recording
 from potclient.datasets.trajectory import tum_line
 from potclient.errors import DatasetError
+from potclient.extras import how_to_install
 from potclient.poses import quaternion_of
 
 ODOMETRIES = ("kiss-icp",)
@@ -103,9 +104,7 @@ def check_installed() -> None:
         DatasetError: kiss-icp is missing.
     """
     if importlib.util.find_spec("kiss_icp") is None:
-        raise DatasetError(
-            "odometry needs the package kiss-icp: pip install 'potserver[odometry]' (or 'potclient[odometry]')"
-        )
+        raise DatasetError(f"odometry needs the package kiss-icp: {how_to_install('odometry')}")
 
 
 def _kiss_icp(points: Float64) -> Any:

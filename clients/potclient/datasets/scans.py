@@ -147,16 +147,15 @@ def natural_key(path: Path) -> tuple[list[tuple[int, int | str]], str]:
 
 
 def read_table(path: Path, what: str) -> Float64:
-    """Rows of numbers; lines starting with # are skipped.
+    """Rows of numbers, with spaces or commas between them; lines starting with # are skipped.
 
     Raises:
         DatasetError: the file is missing or holds something else.
     """
     try:
         text = path.read_text()
-        rows = [
-            line.split() for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")
-        ]
+        lines = [line.replace(",", " ").split() for line in text.splitlines()]
+        rows = [words for words in lines if words and not words[0].startswith("#")]
         table = np.asarray(rows, np.float64)
     except OSError as error:
         raise DatasetError(f"{what}: cannot read {path} ({error.strerror})") from error

@@ -1,4 +1,4 @@
-"""Files of poses - KITTI's, TUM's, and vertices of pose graphs - and which pose belongs to which scan."""
+"""Files of poses - KITTI's, TUM's, NCLT's, and vertices of pose graphs - and which pose belongs to which scan."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 from potclient.arrays import Float64
 from potclient.datasets.scans import natural_key, read_table, stamp_of
 from potclient.errors import DatasetError
-from potclient.poses import interpolate, quaternion_of, quaternion_pose
+from potclient.poses import euler_pose, interpolate, quaternion_of, quaternion_pose
 
 # Looked for in this order. Others are named to the reader of an error or a note.
 POSE_FILES = ("poses.txt", "poses.tum", "trajectory.tum", "graph.txt")
@@ -20,13 +20,15 @@ _MAX_GAP_S = 1.0  # between poses: what a robot did in a longer one, nobody know
 _TEXTS = (".txt", ".tum", ".csv", ".g2o", ".graph")
 _MAX_BYTES, _MAX_TEXTS = 100 << 20, 50  # beyond these, files are not looked into for poses
 _VERTEX_WORDS = ("v", "VERTEX_SE3:QUAT")
+_FIRST_US = 1e14  # numbers from here on are no seconds but microseconds since 1970
+_Z_UP = np.diag([1.0, -1.0, -1.0, 1.0])  # north, east, down to north, west, up
 
 
 class Trajectory(NamedTuple):
     """Poses in the order of their file."""
 
     poses: Float64  # (P, 4, 4) T_map_sensor
-    stamps_ns: list[int] | None  # of TUM files
+    stamps_ns: list[int] | None  # of TUM's and NCLT's files
     form: str  # for people
 
 
@@ -44,6 +46,8 @@ def read_trajectory(path: Path) -> Trajectory:
 
     - KITTI: 12 numbers a line (the top three rows of the matrix) or 16, row-major;
     - TUM: `stamp tx ty tz qx qy qz qw`, the stamp in seconds;
+    - NCLT's ground truth: `utime, x, y, z, roll, pitch, heading`, us, m, radians, of the body in north, east, down. The map is
+      turned to north, west, up; lines without numbers (nan) are left out, and `form` counts them;
     - a graph's vertices: `v0 x y z qx qy qz qw`, or g2o's `VERTEX_SE3:QUAT 0 x y z qx qy qz qw`, in order of their numbers.
 
     Raises:
@@ -61,9 +65,11 @@ def read_trajectory(path: Path) -> Trajectory:
         if (np.diff(stamps) <= 0).any():
             raise DatasetError(f"poses: {path}: the stamps do not grow from line to line")
         return Trajectory(_quaternion_poses(path, table[:, 1:]), stamps, "TUM")
+    if table.shape[1] == 7 and table[0, 0] >= _FIRST_US:
+        return _nclt(path, table)
     if table.shape[1] not in (12, 16):
         raise DatasetError(
-            f"poses: {path} has {table.shape[1]} numbers a line, need 12 (3x4), 16 (4x4, row-major) or 8 (TUM)"
+            f"poses: {path} has {table.shape[1]} numbers a line, need 12 (3x4), 16 (4x4, row-major), 8 (TUM) or 7 (NCLT)"
         )
     return Trajectory(_matrices(path, table), None, "KITTI")
 
@@ -174,6 +180,17 @@ def _quaternion_poses(path: Path, rows: Float64) -> Float64:
         except ValueError as error:
             raise DatasetError(f"poses: {path} pose {line}: {error}") from error
     return np.stack(poses)
+
+
+def _nclt(path: Path, table: Float64) -> Trajectory:
+    known = np.isfinite(table).all(axis=1)
+    left = int((~known).sum())
+    stamps = [round(us) * 1000 for us in table[known, 0].tolist()]
+    if not stamps or (np.diff(stamps) <= 0).any():
+        raise DatasetError(f"poses: {path}: need lines of numbers whose stamps grow")
+    poses = np.stack([_Z_UP @ euler_pose(row[1:4], *row[4:].tolist()) for row in table[known]])
+    form = "NCLT" if not left else f"NCLT, {left} of {len(table)} lines have no numbers"
+    return Trajectory(poses, stamps, form)
 
 
 def _matrices(path: Path, table: Float64) -> Float64:

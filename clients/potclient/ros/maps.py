@@ -27,7 +27,11 @@ def grid_values(mean: Float32, observed: Bool) -> Int8:
     Returns:
         (nx, ny) -1, or 0 .. 100.
     """
-    likeliest = np.where(observed, mean, np.float32(-1.0)).max(axis=2)
+    return percent(np.where(observed, mean, np.float32(-1.0)).max(axis=2))
+
+
+def percent(likeliest: Float32) -> Int8:
+    """Probabilities (nx, ny), below 0 where nothing was observed, as an `OccupancyGrid` has them: -1, or 0 .. 100."""
     return np.where(likeliest < 0, UNKNOWN, np.rint(100.0 * likeliest)).astype(np.int8)
 
 
@@ -90,7 +94,7 @@ def octomap(leaves: Leaves, resolution: float, *, frame_id: str, stamp_ns: int) 
     )
 
 
-def surface_cloud(points: Float64, sd: Float32, *, frame_id: str, stamp_ns: int) -> Any:
+def surface_cloud(points: Float32 | Float64, sd: Float32, *, frame_id: str, stamp_ns: int) -> Any:
     """A `PointCloud2` of surface points with the fields x, y, z, sd and rgb: blue where the map is sure, yellow where not.
 
     Args:

@@ -13,10 +13,27 @@ import numpy as np
 
 from potclient.arrays import Float64
 from potclient.errors import NoTransformError, RosMessageError
-from potclient.poses import interpolate, quaternion_pose
-from potclient.ros.types import ODOMETRY, POSE_WITH_COVARIANCE, frame_of, stamp_of
+from potclient.poses import interpolate, quaternion_of, quaternion_pose
+from potclient.ros.types import ODOMETRY, POSE_WITH_COVARIANCE, TF, frame_of, header, make, stamp_of
 
 MAX_FRAMES = 10_000  # of a tree
+
+
+def transform(parent: str, child: str, T_parent_child: Float64, stamp_ns: int) -> Any:
+    """A `TFMessage` with one transform, (4, 4)."""
+    x, y, z = T_parent_child[:3, 3].tolist()
+    qw, qx, qy, qz = quaternion_of(T_parent_child[:3, :3]).tolist()
+    stamped = make(
+        "geometry_msgs/msg/TransformStamped",
+        header=header(parent, stamp_ns),
+        child_frame_id=child,
+        transform=make(
+            "geometry_msgs/msg/Transform",
+            translation=make("geometry_msgs/msg/Vector3", x=x, y=y, z=z),
+            rotation=make("geometry_msgs/msg/Quaternion", x=qx, y=qy, z=qz, w=qw),
+        ),
+    )
+    return make(TF, transforms=[stamped])
 
 
 class Track:

@@ -6,6 +6,7 @@ import functools
 from typing import TYPE_CHECKING, Any
 
 from potclient.errors import RosMessageError, UsageError
+from potclient.extras import how_to_install
 
 if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
@@ -44,7 +45,7 @@ int8[] data
 
 def rosbags_missing(error: ImportError) -> UsageError:
     """What to say where the extra is not installed."""
-    return UsageError(f"ROS messages need the package rosbags: pip install 'potserver[ros]' ({error})")
+    return UsageError(f"ROS messages need the package rosbags: {how_to_install('ros')} ({error})")
 
 
 @functools.cache

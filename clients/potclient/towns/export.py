@@ -14,6 +14,7 @@ import numpy as np
 from potclient.datasets.clouds import RECORDING_FILE
 from potclient.datasets.scans import RecordedScan
 from potclient.errors import UsageError
+from potclient.extras import how_to_install
 from potclient.towns.recording import TownRecording
 from potschemas import __version__
 
@@ -113,7 +114,7 @@ def _write_ply(path: Path, scan: RecordedScan) -> None:
     try:
         from plyfile import PlyData, PlyElement
     except ImportError as error:
-        raise UsageError("writing PLY needs the package plyfile: pip install 'potclient[towns]'") from error
+        raise UsageError(f"writing PLY needs the package plyfile: {how_to_install('towns')}") from error
     rows = np.empty(len(scan), [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("is_return", "u1")])
     rows["x"], rows["y"], rows["z"] = scan.points.T
     rows["is_return"] = scan.is_return

@@ -10,9 +10,10 @@ import numpy as np
 
 from potclient.arrays import Float32, Float64
 from potclient.errors import DatasetError
+from potclient.extras import how_to_install
 from potclient.towns.solids import Int64, SolidSet, triangles_of
 
-HOW_TO_INSTALL = "towns are ray cast by open3d: pip install 'potclient[towns]'"
+HOW_TO_INSTALL = f"towns are ray cast by open3d: {how_to_install('towns')}"
 
 
 def require() -> None:

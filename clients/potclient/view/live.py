@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from potclient.cells import MapSource, Progress, bounds_of, grid_of, layer_of
 from potclient.client import MapClient
 from potclient.errors import UsageError
-from potclient.view.picture import MapPicture, TileIndex, tile_box, tiles_between
+from potclient.view.layers import Picture, TileIndex, tile_box, tiles_between
 from potclient.watched import WatchedCloud
 from potschemas import messages
 
@@ -30,7 +30,7 @@ class LiveView:
         resolution: m, edge of the cells that are asked for.
     """
 
-    def __init__(self, client: MapClient, picture: MapPicture, resolution: float) -> None:
+    def __init__(self, client: MapClient, picture: Picture, resolution: float) -> None:
         self._client, self._picture, self._resolution = client, picture, resolution
         self._events: queue.SimpleQueue[_Event] = queue.SimpleQueue()
         self._dirty: dict[TileIndex, None] = {}  # in order
@@ -57,6 +57,8 @@ class LiveView:
                 self._draw_events(wait=not self._dirty)
                 if self._dirty:
                     self._draw_tile(next(iter(self._dirty)))
+                    if not self._dirty:
+                        self._picture.all_drawn()
                 if not self._dirty:
                     self.drawn_revision = self.revision
 
@@ -113,9 +115,7 @@ class LiveView:
         self.n_tiles += 1
 
 
-def draw_map(
-    source: MapSource, picture: MapPicture, resolution: float, progress: Progress | None = None
-) -> int:
+def draw_map(source: MapSource, picture: Picture, resolution: float, progress: Progress | None = None) -> int:
     """Draw a whole map as it is now; how many tiles it has.
 
     Raises:
@@ -128,4 +128,5 @@ def draw_map(
         picture.draw_tile(tile, grid_of(source, tile_box(tile, info.tile_size_m, resolution, layer_m)))
         if progress is not None:
             progress(done, len(tiles))
+    picture.all_drawn()
     return len(tiles)

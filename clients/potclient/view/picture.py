@@ -13,24 +13,21 @@ from __future__ import annotations
 
 import math
 import urllib.parse
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from potclient.arrays import Bool, Float64
-from potclient.cells import CellBox
+from potclient.arrays import Float32, Float64
 from potclient.errors import UsageError
-from potclient.mesh import mesh_of, sd_colours
+from potclient.extras import how_to_install
+from potclient.mesh import Mesh
 from potclient.occupancy import Grid
+from potclient.view.layers import TileIndex, layers_of
 from potclient.watched import WatchedCloud
 from potschemas import messages
 
-TileIndex = tuple[int, int, int]
-
-_FREE_BELOW = 0.25
 _LAYERS = ("surface", "free", "unknown")
 _FREE_COLOUR, _UNKNOWN_COLOUR, _NO_ECHO_COLOUR = (110, 190, 110), (150, 150, 160), (90, 90, 90)
 _ROBOT_COLOURS = ((230, 90, 60), (60, 130, 230), (190, 90, 210), (230, 170, 40), (40, 180, 170))
@@ -38,7 +35,7 @@ _POINT_M, _WAY_M = 0.03, 0.06  # radii
 
 
 class MapPicture:
-    """Rerun's recording of a map. Not thread-safe.
+    """Rerun's recording of a map, a `Picture`. Not thread-safe.
 
     Args:
         name: Of the recording, for people.
@@ -50,7 +47,7 @@ class MapPicture:
         try:
             import rerun
         except ImportError as error:
-            raise UsageError("the view needs the package rerun-sdk: pip install 'potserver[view]'") from error
+            raise UsageError(f"the view needs the package rerun-sdk: {how_to_install('view')}") from error
         self._rr: Any = rerun
         self.recording: Any = rerun.RecordingStream("potclient", send_properties=True)
         self.recording.send_recording_name(name)
@@ -94,14 +91,18 @@ class MapPicture:
             grid: Its cells, and one more along each axis so that surfaces of neighbours meet.
         """
         name = "_".join(map(str, tile))
-        is_planar = grid.shape[2] == 1
-        if is_planar:
-            self._draw_cells(f"map/surface/{name}", grid, grid.observed & (grid.mean >= 0.5), None)
+        layers, radius = layers_of(grid), grid.resolution / 6
+        if len(layers.mesh.faces):
+            self._draw_mesh(f"map/surface/{name}", layers.mesh)
         else:
-            self._draw_mesh(f"map/surface/{name}", grid)
-        free = grid.observed & (grid.mean < _FREE_BELOW)
-        self._draw_cells(f"map/free/{name}", grid, free, _FREE_COLOUR)
-        self._draw_cells(f"map/unknown/{name}", grid, ~grid.observed & _beside(free), _UNKNOWN_COLOUR)
+            self._draw_points(f"map/surface/{name}", layers.mesh.vertices, layers.mesh.colours, radius)
+        for layer, points, colour in (
+            ("free", layers.free, _FREE_COLOUR), ("unknown", layers.unknown, _UNKNOWN_COLOUR)
+        ):  # fmt: skip
+            self._draw_points(f"map/{layer}/{name}", points, np.array([colour], np.uint8), radius)
+
+    def all_drawn(self) -> None:
+        """Rerun has shown each tile by itself."""
 
     def forget_tiles(self) -> None:
         """Show no tiles any more: the map was cleared or replaced."""
@@ -152,11 +153,7 @@ class MapPicture:
             if math.isfinite(value):
                 self.recording.log(name, self._rr.Scalars(value))
 
-    def _draw_mesh(self, entity: str, grid: Grid) -> None:
-        mesh = mesh_of(grid)
-        if not len(mesh.faces):
-            self.recording.log(entity, self._rr.Clear(recursive=False))
-            return
+    def _draw_mesh(self, entity: str, mesh: Mesh) -> None:
         self.recording.log(
             entity,
             self._rr.Mesh3D(
@@ -164,46 +161,12 @@ class MapPicture:
             ),
         )
 
-    def _draw_cells(self, entity: str, grid: Grid, cells: Bool, colour: tuple[int, int, int] | None) -> None:
-        """Points at the centres of cells, in a colour or in that of their standard deviation."""
-        places = np.argwhere(cells)
-        if not len(places):
-            self.recording.log(entity, self._rr.Clear(recursive=False))
-            return
-        points = np.asarray(grid.lower, np.float64) + (places + 0.5) * grid.resolution
-        colours: NDArray[Any] = np.array([colour]) if colour else sd_colours(np.sqrt(grid.var[cells]))
-        self.recording.log(entity, self._rr.Points3D(points, colors=colours, radii=grid.resolution / 6))
-
-
-def tile_box(tile: TileIndex, size_m: float, resolution: float, layer_m: float | None) -> CellBox:
-    """The cells of a tile and one more along each axis; of a planar map, those of its layer."""
-    low = np.asarray(tile, np.float64) * size_m
-    box = CellBox.around(low, low + size_m, resolution)
-    if layer_m is None:
-        return box._replace(stop=box.stop + 1)
-    flat = CellBox.around([0, 0, layer_m], [0, 0, layer_m], resolution)
-    first, stop = box.first.copy(), box.stop.copy()
-    first[2], stop[2] = flat.first[2], flat.stop[2]
-    return box._replace(first=first, stop=stop, raised_m=flat.raised_m)
-
-
-def tiles_between(lower: Iterable[float], upper: Iterable[float], size_m: float) -> list[TileIndex]:
-    """The numbers of all tiles that a box (m, map frame) meets."""
-    spans = [
-        range(math.floor(a / size_m), math.floor(b / size_m) + 1) for a, b in zip(lower, upper, strict=True)
-    ]
-    return [(x, y, z) for x in spans[0] for y in spans[1] for z in spans[2]]
-
-
-def _beside(cells: Bool) -> Bool:
-    """Which cells share a face with one of these."""
-    grown = np.zeros_like(cells)
-    for axis in range(3):
-        ahead, behind = [slice(None)] * 3, [slice(None)] * 3
-        ahead[axis], behind[axis] = slice(1, None), slice(None, -1)
-        grown[tuple(ahead)] |= cells[tuple(behind)]
-        grown[tuple(behind)] |= cells[tuple(ahead)]
-    return grown
+    def _draw_points(
+        self, entity: str, points: Float32 | Float64, colours: NDArray[np.uint8], radius: float
+    ) -> None:
+        """Points (N, 3), m, or nothing any more."""
+        shown = self._rr.Points3D(points, colors=colours, radii=radius)
+        self.recording.log(entity, shown if len(points) else self._rr.Clear(recursive=False))
 
 
 def _blueprint() -> Any:

@@ -15,6 +15,7 @@ from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from typing import Any, Protocol, TypeVar
 
+from potclient.extras import how_to_install
 from potserver.errors import DictionaryError
 
 T = TypeVar("T")
@@ -79,7 +80,7 @@ def ray_cluster(address: str, workers: int) -> Iterator[Engine]:
     try:
         ray: Any = importlib.import_module("ray")
     except ImportError as error:
-        raise DictionaryError(f"--ray needs Ray: pip install 'potserver[ray]' ({error})") from error
+        raise DictionaryError(f"--ray needs Ray: {how_to_install('ray')} ({error})") from error
     options: dict[str, Any] = {
         "address": address,
         "log_to_driver": False,

@@ -11,6 +11,7 @@ import numpy as np
 
 from potclient.arrays import Bool, Float64
 from potclient.datasets import RecordedScan
+from potclient.extras import how_to_install
 from potserver.errors import SettingsError
 from potserver.evaluation.mappers import Answer, Mapper, Size
 from potserver.numerics.geometry import voxel_pick
@@ -35,9 +36,7 @@ class OctoMap(Mapper):
         try:
             library: Any = importlib.import_module("pyoctomap")
         except ImportError as error:
-            raise SettingsError(
-                f"OctoMap needs its library: pip install 'potserver[peers]' ({error})"
-            ) from error
+            raise SettingsError(f"OctoMap needs its library: {how_to_install('peers')} ({error})") from error
         self._tree = library.OcTree(resolution_m)
         self._resolution_m = resolution_m
 

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import zipfile
-import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from potclient.datasets.files.beams import Beams, beams_of_columns, beams_of_rows, is_cloud_array, short
+from potclient.datasets.files.beams import Beams, beams_of_columns, beams_of_rows, is_cloud_array
+from potclient.datasets.files.parsing import parsing
 from potclient.errors import DatasetError
 
 _CLOUD_NAMES = ("points", "xyz", "cloud", "point_cloud", "pointcloud", "pcd", "scan", "data", "arr_0")
@@ -22,7 +21,8 @@ def read_npy(path: Path) -> Beams:
     Raises:
         DatasetError: not such a file, damaged, or no points.
     """
-    return _beams(path, _loaded(path))
+    with parsing(path, ".npy"):
+        return _beams(path, np.load(path, allow_pickle=False))
 
 
 def read_npz(path: Path) -> Beams:
@@ -31,19 +31,14 @@ def read_npz(path: Path) -> Beams:
     Raises:
         DatasetError: not such a file, damaged, or not one cloud in it.
     """
-    with _loaded(path) as arrays:
-        try:
-            name = cloud_name(arrays)
-            if name is None:
-                raise DatasetError(
-                    f"{path}: {said_arrays(arrays)}: need one array of points, e.g. points (N, 3)"
-                )
-            beams = _beams(path, arrays[name])
-            if "is_return" not in arrays:
-                return beams
-            is_return = np.asarray(arrays["is_return"])
-        except (ValueError, zipfile.BadZipFile, zlib.error, EOFError, OSError) as error:
-            raise DatasetError(f"{path}: not a readable .npz ({short(error)})") from error
+    with parsing(path, ".npz"), np.load(path, allow_pickle=False) as arrays:
+        name = cloud_name(arrays)
+        if name is None:
+            raise DatasetError(f"{path}: {said_arrays(arrays)}: need one array of points, e.g. points (N, 3)")
+        beams = _beams(path, arrays[name])
+        if "is_return" not in arrays:
+            return beams
+        is_return = np.asarray(arrays["is_return"])
     if is_return.shape != (len(beams.points),):
         raise DatasetError(f"{path}: is_return {is_return.shape} for {len(beams.points)} points")
     return beams._replace(is_return=is_return != 0)
@@ -65,15 +60,6 @@ def said_arrays(arrays: Mapping[str, Any]) -> str:
 
 def _is_cloud(array: Any) -> bool:
     return is_cloud_array(array) or {"x", "y", "z"} <= set(array.dtype.names or ())
-
-
-def _loaded(path: Path) -> Any:
-    try:
-        return np.load(path, allow_pickle=False)
-    except OSError as error:
-        raise DatasetError(f"{path}: cannot be read ({error.strerror or short(error)})") from error
-    except (ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise DatasetError(f"{path}: not a readable file of numpy's ({short(error)})") from error
 
 
 def _beams(path: Path, array: Any) -> Beams:

@@ -59,9 +59,3 @@ def beams_of_rows(path: Path, rows: Any) -> Beams:
 def is_cloud_array(array: Any) -> bool:
     """Whether an array has the shape and type of points, x y z first."""
     return bool(array.dtype.kind in "fiu" and array.ndim in (2, 3) and 3 <= array.shape[-1] <= 32)
-
-
-def short(error: Exception) -> str:
-    """The first line of what a parser complained of."""
-    lines = str(error).strip().splitlines()
-    return lines[0] if lines else type(error).__name__

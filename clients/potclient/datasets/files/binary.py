@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import gzip
-import zlib
 from pathlib import Path
 from typing import NamedTuple
 
@@ -11,6 +10,7 @@ import numpy as np
 
 from potclient.arrays import Floats
 from potclient.datasets.files.beams import Beams
+from potclient.datasets.files.parsing import parsing
 from potclient.errors import DatasetError
 
 _FARTHEST_M = 10_000.0
@@ -78,10 +78,6 @@ def _parsed(path: Path, data: bytes, layout: str) -> tuple[Floats, Floats]:
 
 
 def _bytes_of(path: Path) -> bytes:
-    try:
+    with parsing(path, "gzip file"):
         data = path.read_bytes()
         return gzip.decompress(data) if path.name.lower().endswith(".gz") else data
-    except (gzip.BadGzipFile, EOFError, zlib.error) as error:
-        raise DatasetError(f"{path}: damaged compression ({error})") from error
-    except OSError as error:
-        raise DatasetError(f"{path}: cannot be read ({error.strerror or error})") from error

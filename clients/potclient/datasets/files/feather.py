@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from potclient.datasets.files.beams import Beams, beams_of_columns, short
-from potclient.errors import DatasetError
+from potclient.datasets.files.beams import Beams, beams_of_columns
+from potclient.datasets.files.parsing import parsing
 
 
 def read_feather(path: Path) -> Beams:
@@ -25,16 +25,8 @@ def read_table(path: Path) -> dict[str, Any]:
     Raises:
         DatasetError: not such a file, or pyarrow is missing.
     """
-    try:
-        from pyarrow import ArrowException, feather
-    except ImportError as error:
-        raise DatasetError(
-            f"{path}: reading feather needs the package pyarrow: pip install 'potserver[files]'"
-        ) from error
-    try:
+    with parsing(path, "feather file"):
+        from pyarrow import feather
+
         table = feather.read_table(path)
-    except (ArrowException, ValueError) as error:
-        raise DatasetError(f"{path}: not a readable feather file ({short(error)})") from error
-    except OSError as error:
-        raise DatasetError(f"{path}: cannot be read ({error.strerror or short(error)})") from error
-    return {name: table[name].to_numpy() for name in table.column_names}
+        return {name: table[name].to_numpy() for name in table.column_names}

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from potclient.datasets.files.beams import Beams, short
-from potclient.errors import DatasetError
+from potclient.datasets.files.beams import Beams
+from potclient.datasets.files.parsing import parsing
 
 
 def read_las(path: Path) -> Beams:
@@ -16,17 +16,8 @@ def read_las(path: Path) -> Beams:
     Raises:
         DatasetError: not such a file, or laspy is missing.
     """
-    try:
+    with parsing(path, "LAS file"):
         import laspy
-    except ImportError as error:
-        raise DatasetError(
-            f"{path}: reading LAS needs the package laspy: pip install 'potserver[files]'"
-        ) from error
-    try:
-        cloud = laspy.read(path)
-        points = np.asarray(cloud.xyz, np.float64)
-    except OSError as error:
-        raise DatasetError(f"{path}: cannot be read ({error.strerror or short(error)})") from error
-    except Exception as error:  # laspy and its decompressors raise errors of their own
-        raise DatasetError(f"{path}: not a readable LAS file ({short(error)})") from error
+
+        points = np.asarray(laspy.read(path).xyz, np.float64)
     return Beams(points, np.ones(len(points), np.bool_))

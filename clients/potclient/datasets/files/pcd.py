@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from potclient.arrays import Float64
-from potclient.datasets.files.beams import Beams, beams_of_columns, short
+from potclient.datasets.files.beams import Beams, beams_of_columns
+from potclient.datasets.files.parsing import parsing
 from potclient.errors import DatasetError
 from potclient.poses import quaternion_pose
 
@@ -18,16 +19,10 @@ def read_pcd(path: Path) -> Beams:
     Raises:
         DatasetError: not such a file, truncated, or without x y z.
     """
-    try:
+    with parsing(path, "PCD file"):
         from pypcd4 import PointCloud
-    except ImportError as error:
-        raise DatasetError(f"{path}: reading PCD needs the package pypcd4: pip install pypcd4") from error
-    try:
+
         cloud = PointCloud.from_path(path)
-    except OSError as error:
-        raise DatasetError(f"{path}: cannot be read ({error.strerror or error})") from error
-    except Exception as error:  # pypcd4 raises whatever its parsers raise
-        raise DatasetError(f"{path}: not a readable PCD file ({short(error)})") from error
     data = np.atleast_1d(cloud.pc_data)
     if len(data) != cloud.metadata.points:
         raise DatasetError(f"{path}: truncated, {len(data)} of {cloud.metadata.points} points")
