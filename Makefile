@@ -16,7 +16,7 @@ export NUMBA_CACHE_DIR := $(CURDIR)/$(VENV)/numba-cache
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
 .DEFAULT_GOAL := help
-.PHONY: help venv demo torture test check lint format-check types imports schemas-check bench fix build docs wheels images clean distclean
+.PHONY: help venv demo torture test check lint format-check types imports schemas-check bench fix lock build docs wheels images clean distclean
 
 help: ## this list
 	@echo "usage: make TARGET [PYTHON=/path/to/python3] [ARGS='...']"
@@ -28,7 +28,7 @@ ifneq ($(shell cat $(READY) 2>/dev/null),$(CURDIR))
 endif
 
 # 3.11 first: that is where the pins in constraints.txt were tested most.
-$(READY): pyproject.toml constraints.txt
+$(READY): pyproject.toml constraints.txt locks/dev.txt
 	@python='$(PYTHON)'; \
 	fits='import ensurepip, sys, venv; sys.exit(not (3, 10) <= sys.version_info < (3, 14))'; \
 	if [ -z "$$python" ]; then \
@@ -45,10 +45,20 @@ $(READY): pyproject.toml constraints.txt
 	  "$$python" -m venv --clear $(VENV) || exit 1; \
 	fi; \
 	rm -f $(READY); \
-	$(BIN)/python -m pip install -qq -c constraints.txt -e '.[dev]' || exit 1; \
+	$(BIN)/python -m pip install -qq --no-deps --require-hashes -r locks/dev.txt || exit 1; \
+	$(BIN)/python -m pip install -qq -c constraints.txt torch || exit 1; \
+	$(BIN)/python -m pip install -qq --no-deps --no-build-isolation -e . || exit 1; \
 	$(BIN)/python -c 'import open3d' 2>/dev/null || \
 	  echo "set-up: open3d misses system libraries; Debian, Ubuntu: apt install libgl1 libgomp1 libusb-1.0-0 libx11-6" >&2; \
 	printf '%s\n' '$(CURDIR)' > $(READY)
+
+# Hashes of everything that the images and the set-up install; torch has none, because its builds (CPU, CUDA) come from different
+# places with hashes of their own, and what only CUDA builds need is left out.
+TORCH_ONLY := torch triton cuda-bindings cuda-pathfinder cuda-toolkit nvidia-cublas nvidia-cuda-cupti nvidia-cuda-nvrtc \
+	nvidia-cuda-runtime nvidia-cudnn-cu13 nvidia-cufft nvidia-cufile nvidia-curand nvidia-cusolver nvidia-cusparse \
+	nvidia-cusparselt-cu13 nvidia-nccl-cu13 nvidia-nvjitlink nvidia-nvshmem-cu13 nvidia-nvtx
+LOCK = $(BIN)/uv pip compile -q --universal --python-version 3.10 --generate-hashes --no-header --no-annotate \
+	-c constraints.txt $(TORCH_ONLY:%=--no-emit-package %)
 
 venv: $(READY) ## set up .venv: both commands and all tools
 	@echo "set-up: ready; the commands are $(BIN)/potserver and $(BIN)/potclient"
@@ -92,6 +102,12 @@ bench: $(READY) ## benchmarks; table here, numbers into out/bench/bench.json
 
 torture: $(READY) ## faults, damage, hostile messages and kills; some minutes. ARGS='--help' tells of longer runs
 	@$(BIN)/python benchmarks/torture.py $(ARGS)
+
+lock: $(READY) ## write locks/ anew, after a change of pyproject.toml or constraints.txt
+	@$(LOCK) pyproject.toml --extra ros -o locks/server.txt
+	@$(LOCK) clients/pyproject.toml -o locks/client.txt
+	@$(LOCK) pyproject.toml --extra dev -o locks/dev.txt
+	@printf 'cyclonedx-bom\nhatchling\n' | $(LOCK) - -o locks/build.txt
 
 build: $(READY) ## wheels of potserver and of the torch-free potclient, into dist
 	$(BIN)/python -m hatchling build -d dist

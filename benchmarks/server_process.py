@@ -92,5 +92,4 @@ def serving(*flags: str) -> Iterator[str]:
     try:
         yield str(server.event("server_started")["endpoints"][0])
     finally:
-        server.popen.terminate()
-        server.popen.wait()
+        server.end(signal.SIGTERM)

@@ -39,19 +39,23 @@ def main() -> int:
     if options.endpoint:
         _live(options)
         return 0
-    shm = ("--shm",) if options.shm else ()
-    with serving("--in-memory", *shm) as endpoint:
-        found = _measure(endpoint, options)
+    found = measure(options.sessions, options.at_once, shm=options.shm)
     for name, value in found.items():
         print(f"{name}: {value}")
     keep(options, found)
     return 1 if set(found["exit codes"]) - {"0"} else 0
 
 
-def _measure(endpoint: str, options: argparse.Namespace) -> dict[str, Any]:
+def measure(sessions: int, at_once: int, *, shm: bool = False) -> dict[str, Any]:
+    """Let sessions come and go: their exit codes, and the server's memory after some of them."""
+    with serving("--in-memory", *(("--shm",) if shm else ())) as endpoint:
+        return _measure(endpoint, sessions, at_once, shm)
+
+
+def _measure(endpoint: str, sessions: int, at_once: int, shm: bool) -> dict[str, Any]:
     codes: collections.Counter[str] = collections.Counter()
     rss_mb: dict[int, float] = {}
-    command = [sys.executable, __file__, "--endpoint", endpoint, *(["--shm"] if options.shm else [])]
+    command = [sys.executable, __file__, "--endpoint", endpoint, *(["--shm"] if shm else [])]
 
     def live(number: int) -> str:
         run = subprocess.run([*command, "--robot", f"r{number % 4}"], capture_output=True, timeout=300)
@@ -59,12 +63,12 @@ def _measure(endpoint: str, options: argparse.Namespace) -> dict[str, Any]:
 
     with (
         MapClient(endpoint, timeout_s=60.0) as client,
-        concurrent.futures.ThreadPoolExecutor(options.at_once) as pool,
+        concurrent.futures.ThreadPoolExecutor(at_once) as pool,
     ):
         client.wait_ready(60.0)
-        for number, code in enumerate(pool.map(live, range(options.sessions)), start=1):
+        for number, code in enumerate(pool.map(live, range(sessions)), start=1):
             codes[code] += 1
-            if number in (20, 50, 100, 200) or number == options.sessions:
+            if number in (20, 50, 100, 200) or number == sessions:
                 rss_mb[number] = round(client.stats().rss_bytes / 2**20, 1)
     return {"exit codes": dict(codes), "server's memory after so many sessions, MiB": rss_mb}
 

@@ -1,14 +1,17 @@
 """Tortures a server and its store, and prints what became of it: nothing acknowledged may be lost, and nothing may go unsaid.
 
     make torture                                                  minutes
-    make torture ARGS='--every 1 --pieces 400 --messages 1000000 --kills 100'   a night
+    make torture ARGS='--night'                                   a night: every call, 400 pieces, a million messages, 100
+                                                                  kills, 500 sessions, an hour of a fleet
 
 1. Calls: the process of a store is killed before, or in the middle of, every write, fsync, truncate, rename and unlink, or
-   the disk refuses that call, or it and all that follow. A C compiler is needed: the calls are caught by a preloaded library.
+   the disk refuses that call, or it and all that follow, or the power fails. A C compiler is needed: the calls are caught by
+   a preloaded library.
 2. Files: in every piece of every file of a store a bit flips, a sector is cleared, or the file ends. And a running store is
    copied, file by file.
 3. Messages: hostile ones, over Zenoh.
 4. Kills: SIGKILL of a server under load (`kill.py`).
+5. Sessions that come and go (`sessions.py`), and 50 robots with 200 planners (`fleet.py`).
 """
 
 from __future__ import annotations
@@ -24,9 +27,12 @@ import time
 from collections import Counter
 from pathlib import Path
 
-from benchmarks import kill
+from benchmarks import fleet, kill
+from benchmarks import sessions as sessions_benchmark
 from benchmarks.torture_messages import torture_messages
 from benchmarks.torture_store import Outcomes, build_shim, torture_copies, torture_files
+
+_GROWTH_MB = 64  # of a server's memory that is no leak: compiled code, queues
 
 
 def run_calls(every: int) -> list[Outcomes]:
@@ -59,6 +65,25 @@ def run_kills(kills: int, seed: int) -> Outcomes:
     )
 
 
+def run_sessions(sessions: int) -> Outcomes:
+    """Part 5, sessions: every process must end by itself, and the server's memory must not grow with them."""
+    found = sessions_benchmark.measure(sessions, 2)
+    codes, rss_mb = found["exit codes"], found["server's memory after so many sessions, MiB"]
+    wrong = [f"{n} ended with {code}" for code, n in codes.items() if code != "0"]
+    first, *_, last = (*rss_mb.values(), *rss_mb.values())
+    if last > first + _GROWTH_MB:
+        wrong.append(f"the server's memory grew from {first} to {last} MiB")
+    return Outcomes(f"sessions that came and went, memory {rss_mb}", Counter(codes), wrong)
+
+
+def run_fleet(seconds: float) -> Outcomes:
+    """Part 5, a fleet."""
+    found = fleet.measure(50, 200, seconds)
+    rest = {name: value for name, value in found.items() if not isinstance(value, dict)}
+    counts = Counter(found["what became of clouds and questions"])
+    return Outcomes(f"50 robots, 200 planners, {seconds:g} s, {rest}", counts, list(found["wrong"]))
+
+
 def told(title: str, outcomes: list[Outcomes], begun_s: float) -> int:
     """Print a table; returns how many went wrong."""
     print(f"\n{title} ({time.monotonic() - begun_s:.0f} s)")
@@ -79,8 +104,13 @@ def main() -> int:
     parser.add_argument("--pieces", type=int, default=40, help="part 2: of each file [40]")
     parser.add_argument("--messages", type=int, default=20_000, help="part 3 [20000]")
     parser.add_argument("--kills", type=int, default=5, help="part 4 [5]")
+    parser.add_argument("--sessions", type=int, default=10, help="part 5 [10]")
+    parser.add_argument("--fleet-s", type=float, default=20.0, help="part 5, seconds [20]")
     parser.add_argument("--seed", type=int, default=0, help="of parts 2 to 4 [0]")
+    parser.add_argument("--night", action="store_true", help="the length of a night, whatever else is said")
     options = parser.parse_args()
+    if options.night:
+        vars(options).update(every=1, pieces=400, messages=1_000_000, kills=100, sessions=500, fleet_s=3600.0)
     logging.disable(logging.CRITICAL)  # refusals are what is wanted here
 
     def show(line: str) -> None:
@@ -96,6 +126,8 @@ def main() -> int:
     wrong += told("messages", torture_messages(options.messages, options.seed, show), begun_s)
     begun_s = time.monotonic()
     wrong += told("kills", [run_kills(options.kills, options.seed)], begun_s)
+    begun_s = time.monotonic()
+    wrong += told("sessions", [run_sessions(options.sessions), run_fleet(options.fleet_s)], begun_s)
     print(f"\n{wrong} wrong")
     return 1 if wrong else 0
 

@@ -43,6 +43,7 @@ SOURCE = Path(__file__).with_name("faults.c")
 _SETTINGS = MappingSettings(max_range_m=15.0, beams_per_scan=100)
 _SNAPSHOT_SCANS = 3  # few: faults meet snapshots
 _KEPT = "kept"
+_PAGE = 4096  # bytes that a disk writes at once
 # t: a scan; s: a snapshot; k: a saved map; c: clear; l: load what was saved
 STEPS = "ttskttcttlt"
 
@@ -90,7 +91,12 @@ class Driven:
     def __init__(self, folder: Path) -> None:
         self.mapper, self.order = MappingService(settings=_SETTINGS, threads=1), CloudOrder()
         self.store = MapStore(
-            folder, "default", keeps_evidence=True, health=Health(), snapshot_scans=_SNAPSHOT_SCANS
+            folder,
+            "default",
+            keeps_evidence=True,
+            health=Health(),
+            snapshot_scans=_SNAPSHOT_SCANS,
+            max_resident_bytes=1,  # everything goes to pages, and the disk may refuse those too
         )
         try:
             self.order.replace(self.store.restore(self.mapper).heard)
@@ -107,6 +113,7 @@ class Driven:
             with self.store.keeping(scan) as commit:
                 self.mapper.integrate(scan, commit=commit)
             self.order.remember(scan.robot_id, scan.session, scan.seq)
+            self.store.relieve(self.mapper)
             self.store.advance(self.mapper, self.order.heard)
         elif kind == "c":
             self.mapper.clear(commit=lambda state: self.store.replace(state, {}))
@@ -179,7 +186,52 @@ def torture_calls(every: int, show: Callable[[str], None]) -> list[Outcomes]:
                 shutil.rmtree(folder, ignore_errors=True)
                 show(f"{outcome.name}: call {at} of {n_calls}, {len(outcome.wrong)} wrong")
             outcomes.append(outcome)
+        outcomes += _torture_power(shim, Path(scratch), range(1, n_calls + 1, every), show)
     return outcomes
+
+
+def _torture_power(
+    shim: ctypes.CDLL, scratch: Path, calls: Sequence[int], show: Callable[[str], None]
+) -> list[Outcomes]:
+    """The power fails before a call: of what was not synced nothing is on the disk, or any of its pages are."""
+    outcomes = [
+        Outcomes(f"power cut, {what}") for what in ("all lost that was not synced", "any of its pages lost")
+    ]
+    for at in calls:
+        folder, synced = scratch / f"power-{at}", scratch / f"synced-{at}"
+        shim.faults_shadow(str(synced).encode())
+        told = _in_child(lambda: _run(shim, folder, Fault.KILLED, at), partial=True)  # noqa: B023
+        shim.faults_shadow(b"")
+        for outcome, share in zip(outcomes, (0.0, 0.5), strict=True):
+            disk = _disk_after(folder, synced, scratch / f"disk-{at}", share, random.Random(at))
+            outcome.counts[_judged(told, disk, f"{outcome.name} at call {at}", outcome.wrong)] += 1
+            shutil.rmtree(disk, ignore_errors=True)
+        for used in (folder, synced):
+            shutil.rmtree(used, ignore_errors=True)
+        show(f"power cut: call {at}, {sum(len(outcome.wrong) for outcome in outcomes)} wrong")
+    return outcomes
+
+
+def _disk_after(written: Path, synced: Path, to: Path, share: float, rng: random.Random) -> Path:
+    """What a disk holds after a power cut: files as they were synced last, and of what came after a share of the pages."""
+    to.mkdir()
+    for file in (path for path in written.rglob("*") if path.is_file() and not path.name.endswith("-shm")):
+        now, before = file.read_bytes(), b""
+        if (synced / file.relative_to(written)).exists():
+            before = (synced / file.relative_to(written)).read_bytes()
+        elif rng.random() >= share:
+            continue  # not even its name
+        pages = []
+        for start in range(0, max(len(now), len(before)), _PAGE):
+            cut = slice(start, start + _PAGE)
+            reached = rng.random() < share
+            # a page that did not reach the disk and was never there before reads as zeros below the file's new end
+            pages.append(now[cut] if reached else before[cut] or bytes(len(now[cut])))
+        end = len(now) if rng.random() < share else len(before)
+        place = to / file.relative_to(written)
+        place.parent.mkdir(parents=True, exist_ok=True)
+        place.write_bytes(b"".join(pages)[:end])
+    return to
 
 
 def _count(shim: ctypes.CDLL, folder: Path) -> str:
@@ -193,17 +245,23 @@ def _count(shim: ctypes.CDLL, folder: Path) -> str:
 
 def _one(shim: ctypes.CDLL, folder: Path, fault: Fault, at: int, wrong: list[str]) -> str:
     """One child with one fault, and a second one that opens what it left."""
-    told = _in_child(lambda: _run(shim, folder, fault, at), partial=True).split()
-    done = tuple(int(word[1:]) for word in told if word[0] == "+")
-    refused = [int(word[1:]) for word in told if word[0] == "-"]
-    began = int(told[-1][1:]) if told and told[-1][0] == "?" else None  # in work when it ended
+    told = _in_child(lambda: _run(shim, folder, fault, at), partial=True)
+    return _judged(told, folder, f"{fault.name} at call {at}", wrong)
+
+
+def _judged(told: str, folder: Path, what: str, wrong: list[str]) -> str:
+    """Whether a store holds what a child was told that it holds, in words."""
+    words = told.split()
+    done = tuple(int(word[1:]) for word in words if word[0] == "+")
+    refused = [int(word[1:]) for word in words if word[0] == "-"]
+    began = int(words[-1][1:]) if words and words[-1][0] == "?" else None  # in work when it ended
     maybe = [*refused, *([] if began is None else [began])]
     found = _in_child(lambda: _reopened(folder))
     allowed = {wanted(done): "all acknowledged, nothing else"}
     for extra in maybe:  # what was not acknowledged may be there or not
         allowed.setdefault(wanted(tuple(sorted((*done, extra)))), "all acknowledged, and a step that was not")
     if found not in allowed:
-        wrong.append(f"{fault.name} at call {at}: acknowledged {done}, refused {refused}; found {found}")
+        wrong.append(f"{what}: acknowledged {done}, refused {refused}; found {found}")
     return allowed.get(found, "wrong")
 
 

@@ -1,16 +1,21 @@
 # docker build -f docker/client.Dockerfile -t potclient:0.1.0 .
-FROM python:3.11-slim-bookworm AS build
+# Name the base image by its digest where builds must repeat: --build-arg BASE=python:3.11-slim-bookworm@sha256:...
+ARG BASE=python:3.11-slim-bookworm
+FROM ${BASE} AS build
 ARG PIP_INDEX_URL=
 ARG PIP_EXTRA_INDEX_URL=
 ENV PIP_NO_CACHE_DIR=1 PIP_DISABLE_PIP_VERSION_CHECK=1
 WORKDIR /src
-RUN python -m venv /opt/potclient
-COPY constraints.txt LICENSE ./
+COPY locks locks
+RUN python -m venv /opt/build && /opt/build/bin/pip install -q --no-deps --require-hashes -r locks/build.txt
+RUN python -m venv /opt/potclient && /opt/potclient/bin/pip install -q --no-deps --require-hashes -r locks/client.txt
+COPY LICENSE ./
 COPY clients clients
 COPY schemas schemas
-RUN /opt/potclient/bin/pip install -q -c constraints.txt ./clients
+RUN cd clients && /opt/build/bin/python -m hatchling build -t wheel -d /dist && /opt/potclient/bin/pip install -q --no-deps /dist/*.whl
+RUN /opt/build/bin/cyclonedx-py environment /opt/potclient --pyproject clients/pyproject.toml -o /opt/potclient/sbom.cdx.json
 
-FROM python:3.11-slim-bookworm
+FROM ${BASE}
 RUN useradd --system --uid 10001 --create-home --home-dir /var/lib/potclient potclient
 COPY --from=build /opt/potclient /opt/potclient
 ENV PATH=/opt/potclient/bin:$PATH

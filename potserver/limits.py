@@ -19,9 +19,16 @@ class Limits:
         int, "steps of all rays of one `q/rays`, cells at all poses of one `q/risk`"
     ] = 4_000_000
     max_coordinate_m: Annotated[float, "of anything in the map frame; UTM northings end at 1e7"] = 2.0e7
-    max_map_bytes: Annotated[
-        int, "of one map in memory, about; a cloud that comes then is refused `map_full`"
-    ] = 8 * 2**30
+    max_map_bytes: Annotated[int, "of one map, about; a cloud that comes then is refused `map_full`"] = (
+        8 * 2**30
+    )
+    max_robot_bytes: Annotated[
+        int,
+        "of one map, by what one robot saw; its next cloud is refused `map_full`, those of others are not",
+    ] = 4 * 2**30
+    max_resident_bytes: Annotated[
+        int, "of one map in memory, about; what no scan has touched for longest lies on pages in its store"
+    ] = 2 * 2**30
     max_robots: Annotated[int, "robots remembered at once: poses, presence"] = 1024
 
     # The bytes and the samples of a query bound its work; these only say early that a query asks for too much.

@@ -99,7 +99,12 @@ class MapNode:
             mapper,
             keeper,
             order=CloudOrder(heard, allow_repeats=settings.intake.allow_repeats),
-            bounds=Bounds(settings.intake.max_future_s, limits.max_coordinate_m, limits.max_map_bytes),
+            bounds=Bounds(
+                settings.intake.max_future_s,
+                limits.max_coordinate_m,
+                limits.max_map_bytes,
+                limits.max_robot_bytes,
+            ),
             intake=self.intake,
             reader=CloudReader(limits, poses),
             receipts=self._receipts,

@@ -244,16 +244,27 @@ class MapServer:
 
     def _open_store(self, mapper: MappingService) -> Heard:
         """Give a map what was kept of it; the last numbers of its robots."""
-        s = self.settings.store
+        s, max_resident_bytes = self.settings.store, self.settings.limits.max_resident_bytes
         if not s.directory:
             return {}
         folder, map_id = Path(s.directory).expanduser(), mapper.map_id
         store: MapStore | ReadOnlyStore
         if s.read_only:
-            store = ReadOnlyStore(folder, map_id, keeps_evidence=mapper.keeps_evidence, health=self.health)
+            store = ReadOnlyStore(
+                folder,
+                map_id,
+                keeps_evidence=mapper.keeps_evidence,
+                health=self.health,
+                max_resident_bytes=max_resident_bytes,
+            )
         else:
             store = MapStore(
-                folder, map_id, keeps_evidence=mapper.keeps_evidence, health=self.health, fsync=s.fsync
+                folder,
+                map_id,
+                keeps_evidence=mapper.keeps_evidence,
+                health=self.health,
+                fsync=s.fsync,
+                max_resident_bytes=max_resident_bytes,
             )
         self._stores[mapper.map_id] = store
         return store.restore(mapper).heard

@@ -21,7 +21,8 @@ from potserver.limits import Limits
 SERVER = "server"  # the common name of our own certificate, and our own user
 CONFIG = "{name}.json5"  # what each identity opens its session with, and our own
 USERS = "users"  # the file of passwords: `user:password` a line, as Zenoh wants it
-POSES_HZ = 200.0  # of one robot; faster streams are thinned
+POSES_HZ = 200.0  # of one session; faster streams are thinned
+CLOUDS_HZ = 100.0  # the same; a server maps some tens a second
 
 
 class Auth(str, Enum):
@@ -165,13 +166,39 @@ def server_config(roles: Roles, folder: Path, listen: str, limits: Limits) -> di
         ],
         "downsampling": [
             {
-                "id": "poses",
+                "id": "streams",
                 "flows": ["ingress"],
                 "messages": ["put"],
-                "rules": [{"key_expr": f"{roles.root}/*/in/*/pose", "freq": POSES_HZ}],
+                "rules": [
+                    {"key_expr": f"{roles.root}/*/in/*/pose", "freq": POSES_HZ},
+                    {"key_expr": f"{roles.root}/*/in/*/cloud", "freq": CLOUDS_HZ},
+                ],
             }
         ],
     }
+
+
+class Bounds(NamedTuple):
+    """What a server's configuration lets in."""
+
+    sizes: dict[str, int]  # bytes of `clouds`, `poses` and `questions`
+    poses_hz: float
+
+    @staticmethod
+    def of(config: str) -> Bounds:
+        """Of a configuration that `server_config` made, or one where limits are missing: then nothing is bounded.
+
+        Raises:
+            SettingsError: it is something else.
+        """
+        try:
+            tree = json.loads(config)
+            sizes = {rule["id"]: int(rule["size_limit"]) for rule in tree.get("low_pass_filter", [])}
+            rates = [rule for group in tree.get("downsampling", []) for rule in group["rules"]]
+            hz = [float(rule["freq"]) for rule in rates if rule["key_expr"].endswith("/pose")]
+        except (ValueError, KeyError, TypeError) as error:
+            raise SettingsError(f"not a configuration of `potserver acl`: {error}") from error
+        return Bounds(sizes, min(hz, default=POSES_HZ))
 
 
 def client_config(

@@ -19,7 +19,7 @@ import zenoh
 from potclient import zenoh_config
 from potclient.errors import UsageError
 from potschemas.keys import MapKeys, stats_key
-from potserver.adapters.access import CONFIG, SERVER, Auth, Roles
+from potserver.adapters.access import CONFIG, SERVER, Auth, Bounds, Roles
 from potserver.adapters.session import open_session
 from potserver.errors import SettingsError
 
@@ -27,7 +27,10 @@ STRANGER = "(nobody)"  # somebody without a certificate or a password
 _MAP = "acl-check"
 _OTHERS = zenoh.Locality.REMOTE  # what one session says to itself is no finding
 _SETTLE_S = 0.5  # for declarations to travel, and for what should be denied to arrive all the same
-_PATIENCE_S = 5.0  # for what is allowed
+_PATIENCE_S = 10.0  # for what is allowed
+_PACE_S = 0.03  # between two tries: faster clouds or poses would be thinned, whatever else holds for them
+_BURST = 1000  # poses at once
+_SIZES = {"clouds": 32 * 2**20, "poses": 16 * 2**10, "questions": 16 * 2**20}  # where nothing is bounded
 
 
 class Finding(NamedTuple):
@@ -67,12 +70,13 @@ def measure(roles: Roles, folder: Path) -> list[Finding]:
     """
     found = []
     with _stand_in(roles, folder) as (server, endpoint):
+        bounds = Bounds.of((folder / CONFIG.format(name=SERVER)).read_text(encoding="utf-8"))
         for name in roles.everybody:
             client = _log_in(_config(folder, name, "connect", endpoint))
             found.append(Finding("log in", name, may=True, can=client is not None))
             if client is not None:
                 with client:
-                    found += _tried(name, _Attempts(server, client, roles, name).deeds)
+                    found += _tried(name, _Attempts(server, client, roles, bounds, name).deeds)
         stranger = _config(folder, roles.everybody[0], "connect", endpoint)
         _take_proof(stranger, roles.auth)
         client = _log_in(stranger)
@@ -85,7 +89,9 @@ def measure(roles: Roles, folder: Path) -> list[Finding]:
 class _Attempts:
     """Everything that one identity tries; what it and the server declare for that is declared now."""
 
-    def __init__(self, server: zenoh.Session, client: zenoh.Session, roles: Roles, name: str) -> None:
+    def __init__(
+        self, server: zenoh.Session, client: zenoh.Session, roles: Roles, bounds: Bounds, name: str
+    ) -> None:
         self.deeds: list[_Deed] = []
         self._server, self._client = server, client
         keys, root = MapKeys(roles.root, _MAP), roles.root
@@ -109,30 +115,62 @@ class _Attempts:
         self._answers("answer for the server", False, keys.query("points"))
         self._asks("clear, load, merge a map", is_operator, keys.control("clear"))
         self._asks("change the dictionary", is_operator, keys.control("atoms"))
+        sizes = _SIZES | bounds.sizes
+        self._asks("ask up to the size", True, keys.query("points"), sizes["questions"])
+        self._asks("ask beyond the size", False, keys.query("points"), sizes["questions"] + 1)
+        for what, key in (("clouds", keys.cloud(name)), ("poses", keys.pose(name))):
+            self._puts(f"send {what} up to the size", is_robot, key, sizes[what])
+            self._puts(f"send {what} beyond the size", False, key, sizes[what] + 1)
+        self._floods("send poses beyond the rate", keys.pose(name), bounds.poses_hz)
 
     def _deed(self, name: str, may: bool) -> _Deed:
         self.deeds.append(_Deed(name, may))
         return self.deeds[-1]
 
-    def _puts(self, name: str, may: bool, key: str) -> None:
+    def _puts(self, name: str, may: bool, key: str, n_bytes: int = 0) -> None:
         deed = self._deed(name, may)
-        self._server.declare_subscriber(key, deed.note, allowed_origin=_OTHERS)
-        publisher = self._client.declare_publisher(key)
-        deed.tries.append(lambda: publisher.put(b""))
+
+        def noted(sample: zenoh.Sample) -> None:
+            if len(sample.payload) == n_bytes:
+                deed.note()
+
+        self._server.declare_subscriber(key, noted, allowed_origin=_OTHERS)
+        publisher = self._client.declare_publisher(key, congestion_control=zenoh.CongestionControl.BLOCK)
+        deed.tries.append(lambda: publisher.put(bytes(n_bytes)))
+
+    def _floods(self, name: str, key: str, most_hz: float) -> None:
+        """Twice as fast as it may counts as faster: what is thinned keeps the rate on average alone."""
+        deed = self._deed(name, False)
+        arrived_s: list[float] = []
+
+        def noted(sample: zenoh.Sample) -> None:
+            if len(sample.payload) == 1:
+                arrived_s.append(time.monotonic())
+                if len(arrived_s) > 10 and len(arrived_s) - 1 > 2 * most_hz * (arrived_s[-1] - arrived_s[0]):
+                    deed.note()
+
+        self._server.declare_subscriber(key, noted, allowed_origin=_OTHERS)
+        publisher = self._client.declare_publisher(key, congestion_control=zenoh.CongestionControl.BLOCK)
+
+        def flood() -> None:
+            for _ in range(_BURST):
+                publisher.put(b"x")
+
+        deed.tries.append(flood)
 
     def _hears(self, name: str, may: bool, key: str) -> None:
         deed = self._deed(name, may)
         self._client.declare_subscriber(key, deed.note, allowed_origin=_OTHERS)
         deed.tries.append(lambda: self._server.put(key, b""))
 
-    def _asks(self, name: str, may: bool, key: str) -> None:
+    def _asks(self, name: str, may: bool, key: str, n_bytes: int = 0) -> None:
         deed = self._deed(name, may)
 
         def noted(reply: zenoh.Reply) -> None:
             if reply.ok is not None:
                 deed.note()
 
-        deed.tries.append(lambda: self._client.get(key, noted, timeout=_PATIENCE_S))
+        deed.tries.append(lambda: self._client.get(key, noted, payload=bytes(n_bytes), timeout=_PATIENCE_S))
 
     def _answers(self, name: str, may: bool, key: str) -> None:
         deed = self._deed(name, may)
@@ -159,7 +197,10 @@ class _Attempts:
 def _tried(name: str, deeds: list[_Deed]) -> list[Finding]:
     """Try all of them at once: what is allowed has its effect soon, what is denied has none for a while after that."""
     time.sleep(_SETTLE_S)
-    kept = [attempt() for deed in deeds for attempt in deed.tries]  # tokens live as long as their objects
+    kept = []  # tokens live as long as their objects
+    for attempt in (attempt for deed in deeds for attempt in deed.tries):
+        kept.append(attempt())
+        time.sleep(_PACE_S)
     until = time.monotonic() + _PATIENCE_S
     for deed in deeds:
         if deed.may:
@@ -182,7 +223,8 @@ def _stand_in(roles: Roles, folder: Path) -> Iterator[tuple[zenoh.Session, str]]
             query.reply(query.key_expr, b"")
 
     with session:
-        session.declare_subscriber(keys.cloud("*"), lambda _: None)
+        for key in (keys.cloud("*"), keys.pose("*")):
+            session.declare_subscriber(key, lambda _: None)
         for key in (
             keys.integrate("*"),
             keys.query("*"),

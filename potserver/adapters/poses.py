@@ -24,6 +24,7 @@ log = get_logger("potserver.poses")
 
 POSES_PER_ROBOT = 1024  # kept: 20 s at 50 Hz
 WAIT_S = 0.2  # since a cloud came, for the stream to reach its stamp: a few of its periods
+_LATEST_NS = 1_000_000_000  # behind the newest pose: what is older comes of a clock that went back
 _CHANNEL = 256  # a burst beyond this loses its oldest poses; interpolation bridges the hole
 
 
@@ -173,11 +174,13 @@ class _Track:
         if i < len(self.stamps) and self.stamps[i] == stamp_ns:
             self.poses[i] = pose
             return
-        if len(self.stamps) == max_poses:
-            # no late pose is that late: the robot's clock went back, or its log starts again
-            if i < max(1, max_poses // 2):
-                self.stamps, self.poses = [stamp_ns], [pose]
-                return
+        is_full = len(self.stamps) == max_poses
+        is_late = bool(self.stamps) and stamp_ns < self.stamps[-1] - _LATEST_NS
+        if is_late or (is_full and i < max(1, max_poses // 2)):
+            # no pose is that late: the robot's clock went back, or its log starts again
+            self.stamps, self.poses = [stamp_ns], [pose]
+            return
+        if is_full:
             del self.stamps[0], self.poses[0]
             i -= 1
         self.stamps.insert(i, stamp_ns)

@@ -12,9 +12,10 @@ from potserver.adapters.poses import WAIT_S, PoseNotYetError
 from potserver.adapters.receipts import ReceiptSender
 from potserver.adapters.replies import BUG
 from potserver.adapters.stamps import check_not_future
+from potserver.domain.map_size import MapSize
 from potserver.domain.map_state import MapState
 from potserver.domain.order import CloudOrder
-from potserver.domain.tiles import MapSize, check_reach
+from potserver.domain.tiles import check_reach
 from potserver.domain.types import Float64, TileChange
 from potserver.errors import MapFullError, PotserverError
 from potserver.health import Health
@@ -35,6 +36,7 @@ class Bounds(NamedTuple):
     max_future_s: float  # stamps so far ahead
     max_coordinate_m: float  # of what is merged into the map
     max_map_bytes: int  # no cloud enters a map of so many
+    max_robot_bytes: int  # nor one of a robot whose share of the map is as large
 
 
 class MapWriter:
@@ -147,18 +149,26 @@ class MapWriter:
         log.info("robot_forgotten", map_id=self._map_id, robot_id=robot_id, n_tiles=len(changed.tiles))
         return f"nothing from {robot_id} is left, {len(changed.tiles)} tiles changed"
 
-    def _check_room(self) -> None:
-        n_bytes = self._size.of(self._mapper.state.tiled)
+    def _check_room(self, robot_id: str) -> None:
+        n_bytes = self._size.of(self._mapper.state)
         if n_bytes >= self._bounds.max_map_bytes:
             raise MapFullError(
                 f"the map has {n_bytes} bytes, the limit is {self._bounds.max_map_bytes} (limits.max_map_bytes): save and clear"
                 " it, or forget a robot"
+            )
+        share = self._size.of_robot(robot_id)
+        if share >= self._bounds.max_robot_bytes:
+            self._health.count("maps.shares_full")
+            raise MapFullError(
+                f"{share} bytes of the map are from {robot_id}, the limit is {self._bounds.max_robot_bytes}"
+                " (limits.max_robot_bytes): forget the robot, or save and clear the map"
             )
 
     def _keep(self, state: MapState) -> None:
         self._keeper.replace(state, self._order.heard)
 
     def _tell(self, changed: TileChange) -> None:
+        self._keeper.relieve(self._mapper)
         snapshot = self._mapper.snapshot
         self._receipts.tick(snapshot.map_revision, len(snapshot), changed)
 
@@ -176,7 +186,7 @@ class MapWriter:
         wait_ms = job.wait_ms()
         try:
             self._keeper.check_takes()
-            self._check_room()
+            self._check_room(job.robot_id)
             scan = self._reader.read(job)
             check_not_future(scan.stamp_ns, self._bounds.max_future_s)
             self._order.check(scan.robot_id, scan.session, scan.seq)
@@ -193,12 +203,13 @@ class MapWriter:
             return
         integrate_ms = (time.perf_counter() - started_s) * 1e3
         self._order.remember(scan.robot_id, scan.session, scan.seq)
-        self._keeper.advance(self._mapper, self._order.heard)
         if update.not_leaning is not None:
             self._health.count(f"not_leaning.{update.not_leaning}")
         self._health.observe("integrate", integrate_ms)
         self._health.observe("clouds.wait", wait_ms)
         self._receipts.accept(job, scan, update, wait_ms=wait_ms, integrate_ms=integrate_ms)
+        self._keeper.relieve(self._mapper)
+        self._keeper.advance(self._mapper, self._order.heard)
         self._n_scans += 1
         if self._n_scans % _GIVE_BACK_SCANS == 0:
             allocator.give_back()

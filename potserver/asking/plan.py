@@ -14,6 +14,7 @@ from potserver.domain.kernel_map import as_points
 from potserver.domain.types import Float64
 from potserver.errors import BadPointsError, OutOfRangeError, ShapeError
 from potserver.limits import Limits
+from potserver.numerics.arrays import Int64
 
 PartT = TypeVar("PartT", covariant=True)
 
@@ -53,6 +54,19 @@ class Plan(ABC, Generic[PartT]):
     def parts(self) -> Iterator[PartT]:
         """All parts in order."""
         return (self.part(i) for i in range(self.n_parts))
+
+
+def pieces(sizes: Int64, run: slice) -> Iterator[tuple[int, slice]]:
+    """Lists of these sizes, one behind the other: which of their items lie in a run."""
+    ends = np.cumsum(sizes)
+    first = np.searchsorted(ends, run.start, side="right")
+    for number in range(int(first), len(sizes)):
+        begun = int(ends[number] - sizes[number])
+        if begun >= run.stop:
+            return
+        cut = slice(max(run.start - begun, 0), min(run.stop - begun, int(sizes[number])))
+        if cut.stop > cut.start:
+            yield number, cut
 
 
 def checked_points(points: ArrayLike, limits: Limits) -> Float64:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from potschemas.answers import AnswerRule
 from potschemas.lean import LeanTiles
-from potserver.asking.plan import Plan, checked_box
+from potserver.asking.plan import Plan, checked_box, pieces
 from potserver.asking.tile_codes import Steps, TileCodes, TileKey, TileMemory, code_tile
 from potserver.domain.map_state import MapState
 from potserver.domain.tiles import Tile, TileIndex
@@ -170,21 +170,16 @@ class TilesPlan(Plan[TileRun]):
     def part(self, i: int) -> TileRun:
         """One run of kernels. Without a coding a tile may go on in the next; with one it is where its first kernel is."""
         sizes = np.array([len(tile.kernels) for _, tile in self.tiles], np.int64)
-        starts = np.cumsum(sizes) - sizes
         run = self.items(i)
         if self.coding is not None:
+            starts = np.cumsum(sizes) - sizes
             is_here = (sizes > 0) & (starts >= run.start) & (starts < run.stop)
-            return self._coded(i, np.flatnonzero(is_here), self.coding)
-        start = np.maximum(run.start - starts, 0)
-        counts = np.minimum(run.stop - starts, sizes) - start
-        members = np.flatnonzero(counts > 0)
-        kernels = [
-            self.tiles[t][1].kernels.kernels.take(slice(int(start[t]), int(start[t] + counts[t])))
-            for t in members
-        ]
-        return self._run(i, members, kernels)
+            return self._coded(i, np.flatnonzero(is_here).tolist(), self.coding)
+        found = list(pieces(sizes, run))
+        kernels = [self.tiles[t][1].kernels.kernels.take(cut) for t, cut in found]
+        return self._run(i, [t for t, _ in found], kernels)
 
-    def _coded(self, i: int, members: NDArray[np.intp], coding: Coding) -> TileRun:
+    def _coded(self, i: int, members: Sequence[int], coding: Coding) -> TileRun:
         changes = []
         for t in members:
             index, tile = self.tiles[t]
@@ -196,7 +191,7 @@ class TilesPlan(Plan[TileRun]):
             changes.append(Change(codes, coding.bases[t]))
         return self._run(i, members, [c.codes.others for c in changes])._replace(changes=tuple(changes))
 
-    def _run(self, i: int, members: NDArray[np.intp], kernels: list[KernelSet]) -> TileRun:
+    def _run(self, i: int, members: Sequence[int], kernels: list[KernelSet]) -> TileRun:
         return TileRun(
             np.array([self.tiles[t][0] for t in members], np.int64).reshape(-1, 3),
             np.array([self.tiles[t][1].revision for t in members], np.int64),

@@ -7,8 +7,10 @@ import contextlib
 import os
 import select
 import signal
+import stat
 import sys
 from collections.abc import Iterator
+from pathlib import Path
 from types import FrameType
 from typing import Any
 
@@ -20,6 +22,8 @@ from potserver.commands.shared import (
     add_verb,
     settings_of,
 )
+from potserver.errors import SettingsError
+from potserver.storage.files import make_private_folder
 
 _ABOUT = """\
 Serve maps to robots and planners over Eclipse Zenoh.
@@ -78,6 +82,7 @@ def _run(options: argparse.Namespace) -> int:
     settings = settings_of(options)
     configure_logging(settings.log.level, settings.log.format)
     zenoh.try_init_log_from_env()  # RUST_LOG
+    check_compiled(os.environ.get("NUMBA_CACHE_DIR"))
     from potserver.server import MapServer  # after the flags are known to be good
 
     with StopSignals.installed() as stop:
@@ -93,6 +98,27 @@ def _run(options: argparse.Namespace) -> int:
     # a thread or Zenoh did not end in time: leaving the ordinary way might wait for it for ever
     sys.stderr.flush()
     os._exit(EXIT_UNCLEAN)
+
+
+def check_compiled(folder: str | None) -> None:
+    """See that nobody else can write where numba keeps compiled numerics; the folder is made if it is missing.
+
+    numba pickles what it keeps: who can write there can run code as the server.
+
+    Args:
+        folder: `NUMBA_CACHE_DIR`; none: numba chooses a place of this user's.
+    Raises:
+        SettingsError: somebody else owns the folder, or everybody may write there. StorageError: it cannot be made.
+    """
+    if not folder:
+        return
+    make_private_folder(Path(folder))
+    found = Path(folder).stat()
+    if found.st_uid not in (os.getuid(), 0) or found.st_mode & stat.S_IWOTH:
+        raise SettingsError(
+            f"NUMBA_CACHE_DIR is {folder}, where others than this user may write, and compiled code is run from there. Name a"
+            " folder of your own (chown, chmod 700)"
+        )
 
 
 class StopSignals:

@@ -69,6 +69,19 @@ class KernelMap:
             return self._parts[0].kernels
         return KernelSet.concatenate([part.kernels for part in self._parts])
 
+    @property
+    def parts(self) -> tuple[MapPart, ...]:
+        """What the kernels are kept in."""
+        return self._parts
+
+    @property
+    def box(self) -> Float64 | None:
+        """(2, 3) m, map frame: lower and upper corner of the hinges' box; none without kernels."""
+        if not len(self):
+            return None
+        boxes = np.stack([part.box for part in self._parts])
+        return np.stack([boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)])
+
     @classmethod
     def from_arrays(
         cls,
@@ -110,6 +123,10 @@ class KernelMap:
             weight_var=_float32(v),
         )
         return cls(kernels, rule=rule, threads=threads)
+
+    def with_parts(self, parts: Sequence[MapPart]) -> KernelMap:
+        """The same map from parts that hold the same kernels elsewhere."""
+        return KernelMap(parts, rule=self.rule, map_revision=self.map_revision, threads=self._threads)
 
     def __len__(self) -> int:
         return self._n_kernels

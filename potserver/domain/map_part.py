@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
-from functools import cache, cached_property
+from functools import cache
 
 import numpy as np
 
@@ -23,6 +23,7 @@ class MapPart:
     rest: KernelSet  # on no lattice, map frame
     lookup: KernelIndex  # of the rest
     n_kernels: int
+    box: Float64  # (2, 3) m, map frame: corners of the hinges' box; without kernels the lower one is infinite
 
     @staticmethod
     def of(kernels: KernelSet, rule: AnswerRule = AnswerRule()) -> MapPart:
@@ -32,6 +33,7 @@ class MapPart:
             rest=kernels,
             lookup=_indexed(kernels, rule),
             n_kernels=len(kernels),
+            box=_box(kernels.hinge_mean),
         )
 
     @staticmethod
@@ -71,12 +73,17 @@ class MapPart:
             rest=rest,
             lookup=lookup,
             n_kernels=sum(counts),
+            box=_box(hinge + of_tile * part.tile_m),
         )
 
-    @cached_property
+    @property
     def kernels(self) -> KernelSet:
-        """All kernels, map frame; put together when first asked for."""
+        """All kernels, map frame; put together anew each time."""
         return KernelSet.concatenate([kernels.moved(shift) for kernels, shift in self.members])
+
+
+def _box(hinge: Float64) -> Float64:
+    return np.stack([hinge.min(axis=0, initial=np.inf), hinge.max(axis=0, initial=-np.inf)])
 
 
 @cache

@@ -226,25 +226,6 @@ class TiledMap(NamedTuple):
         )
 
 
-class MapSize:
-    """The bytes of a map that changes tile by tile: only tiles that are not those of before are counted anew."""
-
-    def __init__(self) -> None:
-        self._tiles: Mapping[TileIndex, Tile] = {}
-        self._n_bytes = 0
-
-    def of(self, tiled: TiledMap | None) -> int:
-        """About how many bytes it takes in memory."""
-        before, after = self._tiles, {} if tiled is None else tiled.tiles
-        if before is not after:
-            for index in before.keys() | after.keys():
-                old, new = before.get(index), after.get(index)
-                if old is not new:
-                    self._n_bytes += (new.n_bytes if new else 0) - (old.n_bytes if old else 0)
-            self._tiles = after
-        return self._n_bytes
-
-
 def check_reach(tiled: TiledMap, T_map_tiled: Float64, max_coordinate_m: float) -> None:
     """Refuse to move a map to where no map may be.
 

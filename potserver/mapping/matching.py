@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from enum import Enum
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -12,6 +13,8 @@ from potserver.domain.dictionary import AtomDictionary
 from potserver.domain.types import Atom, Float32, Float64, Sector
 from potserver.numerics.coupling import CouplingCosts, Ragged, coupling_costs
 from potserver.numerics.geometry import rotation_z, thin
+
+_LEVELS = 16  # quantiles of a sketch along an axis
 
 
 class RankScore(str, Enum):
@@ -33,6 +36,8 @@ class Ranking(NamedTuple):
     tolerance: float = 3e-2  # of the marginals, in L1: enough to rank
     max_iterations: int = 1000
     score: RankScore = RankScore.W2
+    # atoms in rotations that a sector is compared with, at most: of more the nearest by a bound, see `_sketch`
+    n_compared: int = 128
     # of the atom: sectors are 60 degrees wide
     rotations_deg: tuple[float, ...] = (-30.0, -15.0, 0.0, 15.0, 30.0)
 
@@ -92,14 +97,25 @@ class Matcher:
             f = self._subsample(sector.free_points, self._ranking.n_free, rng)
             if len(sector.hit_points):
                 centre = _mean(sector.hit_points)
-                hits.add(number, self._subsample(sector.hit_points, self._ranking.n_hits, rng) - centre)
-                free.add(number, f - centre)
+                h = self._subsample(sector.hit_points, self._ranking.n_hits, rng) - centre
+                near = self._nearest([(self._hits, h), (self._free, f - centre)])
+                hits.add(number, h, near)
+                free.add(number, f - centre, near)
             else:
-                alone.add(number, f - _mean(sector.free_points))
+                g = f - _mean(sector.free_points)
+                alone.add(number, g, self._nearest([(self._free_alone, g)]))
         solved = [(batch, self._solve(batch)) for batch in (hits, free, alone)]
         return [
             self._best([batch.of(number, costs) for batch, costs in solved]) for number in range(len(sectors))
         ]
+
+    def _nearest(self, compared: list[tuple[_Side, Float64]]) -> NDArray[np.intp]:
+        """The candidates that a sector's points are compared with: what that costs does not grow with the dictionary."""
+        n, most = len(self._candidates), self._ranking.n_compared
+        if n <= most:
+            return np.arange(n)
+        bound = np.sum([side.bounds(points) for side, points in compared if len(points)], axis=0)
+        return np.sort(np.argpartition(np.broadcast_to(bound, n), most)[:most])
 
     def _subsample(self, points: Float32, n: int, rng: np.random.Generator) -> Float32:
         return points[thin(points, n, self._ranking.voxel_m, rng)]
@@ -107,7 +123,7 @@ class Matcher:
     def _solve(self, batch: _Batch) -> CouplingCosts:
         r = self._ranking
         return coupling_costs(
-            Ragged.of(batch.side.sets), Ragged.of(batch.targets), np.asarray(batch.pairs, np.int64).reshape(-1, 2),
+            batch.side.packed, Ragged.of(batch.targets), np.asarray(batch.pairs, np.int64).reshape(-1, 2),
             reg=r.reg_m2, tolerance=r.tolerance, max_iterations=r.max_iterations, threads=self._threads,
         )  # fmt: skip
 
@@ -135,11 +151,36 @@ class _Side:
     def __init__(self) -> None:
         self.sets: list[Float32] = []
         self.set_of: list[int | None] = []  # candidate -> set
+        self._sketches: list[Float64] = []
 
     def add(self, points: Float64) -> None:
         self.set_of.append(len(self.sets) if len(points) else None)
+        self._sketches.append(_sketch(points) if len(points) else np.full(3 * _LEVELS, np.inf))
         if len(points):
             self.sets.append(points.astype(np.float32))
+
+    @cached_property
+    def packed(self) -> Ragged:
+        """All sets."""
+        return Ragged.of(self.sets)
+
+    @cached_property
+    def _table(self) -> Float64:
+        return np.array(self._sketches)
+
+    def bounds(self, points: Float64) -> Float64:
+        """(C,) m^2: about what the cheapest plan from a candidate's points to these costs at least; infinite without points."""
+        return np.asarray(np.square(self._table - _sketch(points)).sum(axis=1) / _LEVELS)
+
+
+def _sketch(points: Float64) -> Float64:
+    """Quantiles along each axis.
+
+    Costs of transport are sums over the axes, and along one axis the cheapest plan keeps the order: so squared differences of
+    two sketches, summed over the axes, are a lower bound of the squared 2-Wasserstein distance, up to what quantiles leave out.
+    """
+    levels = (np.arange(_LEVELS) + 0.5) / _LEVELS
+    return np.quantile(points, levels, axis=0).astype(np.float64).reshape(-1)
 
 
 class _Batch:
@@ -152,12 +193,13 @@ class _Batch:
         self._row: NDArray[np.int64] = np.full((n_sectors, len(side.set_of)), -1, np.int64)
         self._has: NDArray[np.bool_] = np.zeros(n_sectors, bool)
 
-    def add(self, sector: int, points: Float64) -> None:
-        """Pose the problems of one sector; none if it has no points of this label."""
+    def add(self, sector: int, points: Float64, candidates: NDArray[np.intp]) -> None:
+        """Pose the problems of one sector with some candidates; none if it has no points of this label."""
         if len(points) == 0:
             return
         self._has[sector] = True
-        for candidate, number in enumerate(self.side.set_of):
+        for candidate in candidates:
+            number = self.side.set_of[candidate]
             if number is not None:
                 self._row[sector, candidate] = len(self.pairs)
                 self.pairs.append((number, len(self.targets)))

@@ -42,6 +42,7 @@ PAPER = Method(
         tolerance=1e-3,
         score=RankScore.NORMALISED,
         rotations_deg=tuple(45.0 * k for k in range(-4, 4)),
+        n_compared=256,
     ),
     coupling=CouplingOptions(
         n_points=1500,

@@ -12,6 +12,7 @@ import numpy as np
 from potserver.domain.dictionary import AtomDictionary
 from potserver.domain.kernel_map import KernelMap
 from potserver.domain.map_state import MapState
+from potserver.domain.pages import Pages
 from potserver.domain.running_scores import RunningScores
 from potserver.domain.tiles import TiledMap, TileGrid, TileIndex
 from potserver.domain.types import Float64, MapUpdate, Scan, TileChange, yaw_pose
@@ -199,6 +200,20 @@ class MappingService:
             state.tiled, robot_id, self._pipeline.fusion, moment, threads=self._threads
         )
         return self._edited(tiled, changed, moment, state.n_scans, commit)
+
+    def relieve(self, pages: Pages) -> None:
+        """Keep in memory what it may hold of the map, and the rest on pages; the map is the same, to the bit.
+
+        Raises:
+            OSError: the disk refuses; all stays where it was.
+        """
+        state = self.state
+        if state.tiled is None:
+            return
+        tiled = pages.relieve(state.tiled)
+        if tiled is not state.tiled:
+            snapshot = state.snapshot.with_parts(list(tiled.parts.values()))
+            self.state = dataclasses.replace(state, tiled=tiled, snapshot=snapshot)
 
     def warm_up(self) -> None:
         """Compile or load the numerics on small synthetic scans, in a map of its own."""

@@ -25,6 +25,7 @@ from potserver.domain.folders import sync_folder
 from potserver.domain.kernel_map import KernelMap
 from potserver.domain.map_state import MapState
 from potserver.domain.order import Heard
+from potserver.domain.pages import Pages
 from potserver.domain.running_scores import RunningScores
 from potserver.domain.tiles import Tile, TiledMap, TileGrid, TileIndex
 from potserver.domain.types import KernelSet
@@ -155,13 +156,15 @@ class MapFile:
         self._written: dict[TileIndex, tuple[int, int]] = {}  # revision and digest of each tile
         self._epoch: int | None = None  # which those revisions are of
 
-    def read(self) -> SavedMap | None:
+    def read(self, pages: Pages | None = None) -> SavedMap | None:
         """The map, or None where none was written yet; from now on only what differs from it is written.
 
+        Args:
+            pages: For what memory may not hold of it.
         Raises:
-            MapFileError: it is damaged.
+            MapFileError: it is damaged. StorageError: the disk has no room for pages.
         """
-        saved = _read(self._connection, self.path, self._written)
+        saved = _read(self._connection, self.path, self._written, pages)
         self._epoch = None if saved is None else saved.record.epoch
         return saved
 
@@ -241,16 +244,18 @@ def write_map(path: Path, state: MapState, origin: Origin) -> int:
     return n_bytes
 
 
-def read_map(path: Path) -> SavedMap:
+def read_map(path: Path, pages: Pages | None = None) -> SavedMap:
     """Read a `*.map` file or a store's `tiles.sqlite`, beside the server that writes it too: from one transaction.
 
     Args:
         path: The file.
+        pages: For what memory may not hold of it.
     Raises:
         MapFileError: there is no such file, or it is damaged, of another version, or holds no map yet.
+        StorageError: the disk has no room for pages.
     """
     with contextlib.closing(connect_read_only(path, KIND)) as connection:
-        saved = _read(connection, path, {})
+        saved = _read(connection, path, {}, pages)
     if saved is None:
         raise MapFileError(
             f"{path} holds no map yet: a server writes it at its first snapshot, or at `potclient map save`",
@@ -308,10 +313,12 @@ def _read(
     connection: sqlite3.Connection,
     path: Path,
     written: dict[TileIndex, tuple[int, int]],
+    pages: Pages | None,
 ) -> SavedMap | None:
     """Read everything in one transaction, so that a writer beside us does not matter; `written` is filled."""
     tiles: dict[TileIndex, Tile] = {}
-    n_bytes, threads = 0, default_threads()
+    n_bytes = n_resident = 0
+    threads = default_threads()
     with reading(path), contextlib.ExitStack() as stack:
         connection.execute("BEGIN")
         stack.callback(connection.execute, "COMMIT")
@@ -339,6 +346,10 @@ def _read(
 
         while some := rows.fetchmany(_AT_ONCE):
             for row, (index, tile) in zip(some, parallel_map(decoded, some, threads, "files"), strict=True):
+                n_resident += tile.n_bytes
+                if pages is not None and n_resident > pages.max_resident_bytes:
+                    with disk_faults("write pages of", path):
+                        tile = pages.keep(tile)
                 tiles[index] = tile
                 n_bytes += len(row[-1])
                 written[index] = (tile.revision, seal_number(row[-1]))
@@ -346,8 +357,11 @@ def _read(
         raise _damaged(path, f"it has {len(tiles)} tiles, and not the {record.n_tiles} that were written")
     if grid is None:
         return SavedMap(record, None, 0, version)
-    tiled = TiledMap.empty(grid)._replace(robots=tuple(record.robots)).with_tiles(tiles, threads=threads)
-    return SavedMap(record, tiled, n_bytes, version)
+    empty = TiledMap.empty(grid)._replace(robots=tuple(record.robots))
+    if pages is None:
+        return SavedMap(record, empty.with_tiles(tiles, threads=threads), n_bytes, version)
+    with disk_faults("write pages of", path):
+        return SavedMap(record, pages.gather(empty, tiles), n_bytes, version)
 
 
 def _parse(path: Path, data: object) -> MapRecord:

@@ -24,6 +24,7 @@ import msgspec
 from potserver.codec.clouds import encode_cloud, read_cloud
 from potserver.domain.map_state import MapState
 from potserver.domain.order import CloudOrder, Heard
+from potserver.domain.pages import Pages
 from potserver.domain.types import Scan
 from potserver.errors import (
     MapFileError,
@@ -58,6 +59,7 @@ Commit = Callable[[], None]  # the scan counts from when it returns
 SAVED = "saved"
 SNAPSHOT_SCANS = 16  # a restart after a crash integrates at most so many again: seconds
 SNAPSHOT_BYTES = 64 * 2**20  # large scans make a snapshot due earlier
+RESIDENT_BYTES = 2 * 2**30
 MAX_SAVED = 100  # copies with a name: whoever reaches the server may ask for one more
 _REPORT_S = 2.0  # between two lines of progress
 _IN_MEMORY = "this server keeps its maps in memory only: start it with --store DIR, or without --in-memory"
@@ -94,7 +96,7 @@ class MapStore:
         fsync: bool = True,
         snapshot_scans: int = SNAPSHOT_SCANS,
         snapshot_bytes: int = SNAPSHOT_BYTES,
-        max_saved: int = MAX_SAVED,
+        max_resident_bytes: int = RESIDENT_BYTES,
     ) -> None:
         """Open the folder `<folder>/<map_id>`, or make it.
 
@@ -106,7 +108,7 @@ class MapStore:
             fsync: Wait for the disk with each scan. Without, a crash of the machine may take the last ones; a crash of the
                 process does not.
             snapshot_scans, snapshot_bytes: A snapshot is written after so many scans, or so many bytes of the journal.
-            max_saved: Copies with a name that may lie in `<folder>/saved/<map_id>`.
+            max_resident_bytes: Of the map that stay in memory; the rest lies in a file without a name in the folder.
         Raises:
             StorageError: another server has the folder, or the disk refuses.
             MapFileError: a file in it is damaged, or of another version.
@@ -115,7 +117,7 @@ class MapStore:
         self._saved = folder / SAVED / map_id
         self._map_id, self._keeps_evidence, self._health = map_id, keeps_evidence, health
         self._snapshot_scans, self._snapshot_bytes = snapshot_scans, snapshot_bytes
-        self._max_saved, self._fsync = max_saved, fsync
+        self._fsync = fsync
         make_private_folder(folder)
         make_private_folder(self.folder)
         has_begun = check_complete(self.folder)
@@ -125,6 +127,7 @@ class MapStore:
         except BaseException:
             self._journal.leave()
             raise
+        self._pages = Pages(self.folder, max_resident_bytes)
         self._mark: Mark | None = None  # from `restore` on
         self._files: NamedFiles | None = None
         self._edition = 0  # of the newest snapshot
@@ -133,7 +136,7 @@ class MapStore:
         self._unsaved_bytes = 0  # of the journal, since the last snapshot that was asked for
         self._asked = 0  # number that the last snapshot was asked for at
         self._newest: _Newest | None = None
-        self._written: MapState | None = None  # what the last snapshot holds
+        self._written: tuple[int, int] | None = None  # epoch and revision of what the last snapshot holds
         self._changed = threading.Condition()
         self._writing = threading.Lock()  # one snapshot at a time
         self._wanted = self._closed = False
@@ -149,7 +152,7 @@ class MapStore:
             MapFileError: something that must be there is damaged or missing, or the settings do not fit the map.
         """
         started_s = time.perf_counter()
-        saved = self._tiles.read()
+        saved = self._tiles.read(self._pages)
         mark = read_mark(self.folder / MARK)
         standing = check_agreement(self.folder, self._journal, None if saved is None else saved.record, mark)
         order = CloudOrder()
@@ -162,7 +165,7 @@ class MapStore:
             self._check_fits(mapper, saved, self._tiles.path)
             mapper.restore(saved.state(epoch=epoch))
             if keeps_epoch:
-                self._written = mapper.state
+                self._written = mapper.state.epoch, mapper.state.map_revision
         n_replayed = self._replay(mapper, order)
         self._begin(mapper.state, order.heard, standing, mark)
         log.info(
@@ -211,6 +214,7 @@ class MapStore:
                     reason="settings",
                 ) from error
             self._unsaved_bytes += len(payload)
+            self.relieve(mapper)
             order.remember(scan.robot_id, scan.session, scan.seq)
             done += 1
             if time.monotonic() - reported_s > _REPORT_S:
@@ -257,6 +261,14 @@ class MapStore:
         self._health.count("store.appends")
         self._health.observe("journal", (time.perf_counter() - started_s) * 1e3)
 
+    def relieve(self, mapper: MappingService) -> None:
+        """Move to pages what memory may not hold of the map. If the disk refuses, it stays in memory, and that is counted."""
+        try:
+            mapper.relieve(self._pages)
+        except OSError as error:
+            self._health.count("store.pages_failed")
+            log.warning("pages_failed", map_id=self._map_id, detail=str(error))
+
     def advance(self, mapper: MappingService, heard: Heard) -> None:
         """The last scan is in the map; a snapshot is begun if enough have come. Never waits.
 
@@ -299,9 +311,9 @@ class MapStore:
             return f"the snapshot holds all {state.n_scans} scans"
         path = self._saved / f"{name}.map"
         others = [p for p in self._saved.glob("*.map") if p != path]
-        if len(others) >= self._max_saved:
+        if len(others) >= MAX_SAVED:
             raise TooLargeError(
-                f"{len(others)} maps are saved already, the limit is {self._max_saved}: move some out of {self._saved}"
+                f"{len(others)} maps are saved already, the limit is {MAX_SAVED}: move some out of {self._saved}"
             )
         make_private_folder(self._saved.parent)
         n_bytes = write_map(path, state, Origin(self._map_id, self._keeps_evidence, heard))
@@ -325,7 +337,7 @@ class MapStore:
                 else ""
             )
             raise UnknownMapError(f"no map was saved as {name!r}; there are: {names}{hint}")
-        saved = read_map(path)
+        saved = read_map(path, self._pages)
         self._check_fits(mapper, saved, path)
         revision = max(mapper.state.map_revision, saved.record.revision) + 1
         return saved.state(epoch=secrets.randbits(62), revision=revision), saved.record.heard
@@ -335,6 +347,7 @@ class MapStore:
     def drop(self) -> None:
         """Close without a last snapshot; what was never restored stays as it was found."""
         self._end_snapshots()
+        self._pages.close()
         self._tiles.leave()
         self._journal.leave()
         if self._mark is not None:
@@ -351,7 +364,7 @@ class MapStore:
             newest = self._newest
             # a scan that is in the journal and not in the map is the next start's
             if newest is not None and newest.number == self._number:
-                if newest.state is not self._written:
+                if (newest.state.epoch, newest.state.map_revision) != self._written:
                     self._write(newest)
                 complete_to = newest.number
             self._journal.close(complete_to=complete_to)
@@ -361,6 +374,7 @@ class MapStore:
             log.error("last_snapshot_failed", map_id=self._map_id, detail=str(error))
             return False
         finally:
+            self._pages.close()
             self._tiles.close()
             self._journal.close()
             self._mark.close()
@@ -422,7 +436,7 @@ class MapStore:
         self._check_files()
         self._edition += 1
         self._advance_mark(edition=self._edition)
-        self._taken, self._written = newest.number, newest.state
+        self._taken, self._written = newest.number, (newest.state.epoch, newest.state.map_revision)
         elapsed_ms = (time.perf_counter() - started_s) * 1e3
         self._health.count("store.snapshots")
         self._health.observe("snapshot", elapsed_ms)
@@ -463,6 +477,9 @@ class MemoryOnly:
     def keeping(self, scan: Scan) -> Iterator[Commit]:
         """Nothing to do."""
         yield lambda: None
+
+    def relieve(self, mapper: MappingService) -> None:
+        """Nothing to do: there is no disk."""
 
     def advance(self, mapper: MappingService, heard: Heard) -> None:
         """Nothing to do."""

@@ -16,7 +16,7 @@ from potserver.mapping.service import MappingService
 from potserver.storage.agreement import JOURNAL, MARK, TILES
 from potserver.storage.files import disk_faults
 from potserver.storage.journal import is_in_use
-from potserver.storage.map_store import Commit, MapStore, Restored
+from potserver.storage.map_store import RESIDENT_BYTES, Commit, MapStore, Restored
 from potserver.storage.sqlite import in_use, log_of
 
 _WHY = "this server answers from its maps and changes none: it was started with --read-only"
@@ -46,10 +46,19 @@ class ReadOnlyStore:
 
     durable = False
 
-    def __init__(self, folder: Path, map_id: str, *, keeps_evidence: bool, health: Health) -> None:
-        """Take the folder `<folder>/<map_id>`; see `MapStore`."""
+    def __init__(
+        self,
+        folder: Path,
+        map_id: str,
+        *,
+        keeps_evidence: bool,
+        health: Health,
+        max_resident_bytes: int = RESIDENT_BYTES,
+    ) -> None:
+        """Take the folder `<folder>/<map_id>`; see `MapStore`. Pages lie in the temporary folder."""
         self._folder, self._map_id = folder, map_id
         self._keeps_evidence, self._health = keeps_evidence, health
+        self._max_resident_bytes = max_resident_bytes
 
     def restore(self, mapper: MappingService) -> Restored:
         """Give an empty mapper the map that is kept, see `MapStore.restore`.
@@ -66,6 +75,7 @@ class ReadOnlyStore:
                 keeps_evidence=self._keeps_evidence,
                 health=self._health,
                 fsync=False,
+                max_resident_bytes=self._max_resident_bytes,
             )
             try:
                 return store.restore(mapper)
@@ -79,6 +89,9 @@ class ReadOnlyStore:
     def keeping(self, scan: Scan) -> contextlib.AbstractContextManager[Commit]:
         """Raises ReadOnlyError, as all that follows does."""
         raise ReadOnlyError(_WHY)
+
+    def relieve(self, mapper: MappingService) -> None:
+        """Nothing to do: what memory may not hold is on pages since `restore`."""
 
     def advance(self, mapper: MappingService, heard: Heard) -> None:
         """Not here."""

@@ -135,3 +135,26 @@ def test_a_pose_from_the_future_is_refused() -> None:
 def test_a_pose_that_is_not_rigid_is_refused() -> None:
     with pytest.raises(BadPoseError):
         PoseBuffer().add("r", 0, np.diag([1.0, 1, -1, 1]))
+
+
+@pytest.mark.parametrize("n_before", [1, 3, 500, 1024])
+def test_a_stream_goes_on_at_once_when_the_robots_clock_goes_back(n_before: int) -> None:
+    poses = PoseBuffer()
+    hour = 3_600_000
+    for i in range(n_before):
+        poses.add("r", (hour + 20 * i) * MS, yaw_pose(i, 0, 0))
+    for i in range(3):
+        poses.add("r", 20 * i * MS, yaw_pose(1000 + i, 0, 0))
+        with pytest.raises(PoseNotYetError):  # the next pose is on its way: worth a wait, as ever
+            poses.at("r", (20 * i + 10) * MS)
+    assert poses.at("r", 30 * MS)[0, 3] == pytest.approx(1001.5)
+    poses.add("r", 10 * MS, yaw_pose(1000.5, 0, 0))
+    assert poses.at("r", 5 * MS)[0, 3] == pytest.approx(1000.25), "a late pose still finds its place"
+
+
+def test_one_pose_from_the_future_costs_the_stream_no_more_than_one_pose() -> None:
+    poses = PoseBuffer()
+    now_ns = time.time_ns()
+    for ms in (0, 20, 4900, 40, 60):  # the third is forged, or comes of a clock that jumped
+        poses.add("r", now_ns + ms * MS, yaw_pose(ms, 0, 0))
+    assert poses.at("r", now_ns + 50 * MS)[0, 3] == pytest.approx(50.0)

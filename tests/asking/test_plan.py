@@ -57,7 +57,7 @@ def numbers_in(part: Any) -> np.ndarray:
     if dataclasses.is_dataclass(part):
         part = [getattr(part, field.name) for field in dataclasses.fields(part)]
     if isinstance(part, tuple | list):
-        return np.concatenate([numbers_in(value) for value in part])
+        return np.concatenate([np.zeros(0), *(numbers_in(value) for value in part)])
     return np.zeros(0) if part is None else np.asarray(part, np.float64).reshape(-1)
 
 

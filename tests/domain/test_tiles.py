@@ -12,7 +12,6 @@ from potserver.domain.tiles import (
     CARRIED,
     COARSE,
     MapKernels,
-    MapSize,
     Region,
     TiledMap,
     TileGrid,
@@ -172,18 +171,3 @@ def test_a_map_may_be_moved_as_far_as_maps_may_be_and_no_further() -> None:
         with pytest.raises(OutOfRangeError, match="the limit is 1100 m"):
             check_reach(tiled, yaw_pose(x_m, 0.0, 1.0), 1100.0)
     check_reach(TiledMap.empty(tiled.grid), yaw_pose(1e300, 0.0, 0.0), 1100.0)
-
-
-def test_the_size_of_a_map_follows_its_changes() -> None:
-    tiled, size = _map(np.zeros(3)), MapSize()
-    whole = sum(tile.n_bytes for tile in tiled.tiles.values())
-    assert size.of(None) == 0
-    assert size.of(tiled) == whole > 10_000
-    first, second = list(tiled.tiles)[:2]
-    empty = tiled.tiles[first]._replace(
-        rows=tiled.tiles[first].rows.take(slice(0, 0)), kernels=tiled.tiles[first].kernels.take(slice(0, 0))
-    )
-    changed = tiled.with_tiles({first: empty, second: tiled.tiles[first]})
-    assert size.of(changed) == sum(tile.n_bytes for tile in changed.tiles.values()) != whole
-    assert size.of(tiled) == MapSize().of(tiled) == whole
-    assert size.of(None) == 0

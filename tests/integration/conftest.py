@@ -23,6 +23,7 @@ from potschemas.answers import AnswerRule
 from potschemas.keys import MapKeys, stats_key
 from potserver.config import Settings, load_settings
 from potserver.domain.dictionary import AtomDictionary
+from potserver.domain.kernel_map import KernelMap
 from potserver.domain.map_state import MapState
 from potserver.domain.types import KernelSet, MapUpdate, Occupancy, Scan, TileChange
 from potserver.mapping.settings import MappingSettings
@@ -229,6 +230,8 @@ class FakeSnapshot:
 
     def __init__(self, owner: FakeMapper, kernels: KernelSet, map_revision: int) -> None:
         self._owner, self.kernels, self.map_revision = owner, kernels, map_revision
+        real = KernelMap(kernels, threads=1)
+        self.parts, self.box = real.parts, real.box
 
     def __len__(self) -> int:
         return len(self.kernels)

@@ -95,7 +95,9 @@ def test_everybody_can_do_what_the_roles_say_and_no_more(kind: str, request: pyt
     found = measure(roles, folder)
     assert [finding for finding in found if finding.may != finding.can] == []
     assert {finding.who for finding in found} == {"r1", "r2", "p1", "ops", "(nobody)"}
-    assert sum(finding.can for finding in found) == 4 * 5 + 2 * 4 + 2
+    assert sum(finding.can for finding in found) == 4 * 6 + 2 * 6 + 2
+    bounded = [finding for finding in found if "the size" in finding.deed or "the rate" in finding.deed]
+    assert len(bounded) == 4 * 7
 
 
 def test_the_check_finds_what_is_open_and_what_is_shut(
@@ -114,7 +116,22 @@ def test_the_check_finds_what_is_open_and_what_is_shut(
     assert "p1 cannot ask" in said.err
     assert "r2 CAN" not in said.err
     assert said.out.count("ALLOWED") == 1
-    assert said.out.count("DENIED") == 4
+    assert said.out.count("DENIED") == 8, "asking, and asking much"
+
+
+def test_the_check_finds_where_sizes_and_rates_are_not_bounded(
+    lab: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "unbounded"
+    shutil.copytree(lab, folder)
+    config = json.loads((folder / "server.json5").read_text())
+    del config["low_pass_filter"], config["downsampling"]
+    (folder / "server.json5").write_text(json.dumps(config))
+    assert main(["acl", "--check", "-o", str(folder)]) == 1
+    said = capsys.readouterr().err
+    for what in ("clouds beyond the size", "poses beyond the size", "poses beyond the rate"):
+        assert said.count(f"CAN send {what}") == 2, "both robots"
+    assert said.count("CAN ask beyond the size") == 4
 
 
 # --- with a real server -------------------------------------------------------------------------------------

@@ -251,6 +251,23 @@ def test_a_forged_cloud_ahead_shuts_nobody_out_and_old_ones_stay_old(make_rig: M
     assert client.error("integrate", forged).code is ErrorCode.OLD_SEQ
 
 
+def test_a_pose_stream_is_followed_when_the_clock_goes_back(make_rig: MakeRig) -> None:
+    rig = make_rig()
+    client = rig.client()
+    hour = 3600 * 10**9
+    stamps = (hour, hour + 10**8, 10**9, 10**9 + 10**8)  # an hour back in between
+    for n, stamp_ns in enumerate(stamps, start=1):
+        pose = pose_message(stamp_ns, float(n))
+        client.put(client.keys.pose("r1"), wire.encode(pose), wire.encoding_of(pose))
+        until(lambda n=n: client.stats().counters.get("poses.accepted") == n, "a pose")  # type: ignore[misc]
+        if n == 2:
+            client.one(
+                "integrate", make_cloud(seq=1, robot="r1", T_map_sensor=None, stamp_ns=hour + 5 * 10**7)
+            )
+    client.one("integrate", make_cloud(seq=2, robot="r1", T_map_sensor=None, stamp_ns=10**9 + 5 * 10**7))
+    np.testing.assert_allclose([scan.T_map_sensor[0, 3] for scan in rig.mapper.scans], [1.5, 3.5], atol=1e-9)
+
+
 def test_repeats_may_be_allowed(make_rig: MakeRig) -> None:
     client = make_rig(intake__allow_repeats=True).client()
     client.one("integrate", make_cloud(seq=5, robot="r1"))

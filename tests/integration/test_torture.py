@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks import torture_store
+from benchmarks import fleet, torture_store
 from benchmarks.torture import run_calls
 from benchmarks.torture_messages import mutated, torture_messages
 from benchmarks.torture_store import STEPS, Driven, digest, torture_copies, torture_files, wanted
@@ -18,7 +18,14 @@ from benchmarks.torture_store import STEPS, Driven, digest, torture_copies, tort
 @pytest.mark.skipif(shutil.which("cc") is None, reason="the library that catches calls needs a C compiler")
 def test_a_fault_at_some_calls_loses_nothing_acknowledged() -> None:
     outcomes = run_calls(every=37)
-    assert [outcome.name for outcome in outcomes] == ["killed", "torn", "refused once", "refused from"]
+    assert [outcome.name for outcome in outcomes] == [
+        "killed",
+        "torn",
+        "refused once",
+        "refused from",
+        "power cut, all lost that was not synced",
+        "power cut, any of its pages lost",
+    ]
     assert all(outcome.n >= 5 for outcome in outcomes), "the library catches the calls"
     assert [line for outcome in outcomes for line in outcome.wrong] == []
     for outcome in outcomes:
@@ -64,3 +71,12 @@ def test_hostile_messages_get_typed_answers() -> None:
 def test_mutations_are_many() -> None:
     rng = random.Random(3)
     assert len({mutated(b"a message of some length", [b"another"], rng) for _ in range(100)}) > 90
+
+
+@pytest.mark.slow
+def test_a_small_fleet_is_answered_and_its_clouds_are_in_the_map() -> None:
+    found = fleet.measure(3, 6, 4.0)
+    assert found["wrong"] == []
+    words = found["what became of clouds and questions"]
+    assert words["cloud accepted"] >= 3
+    assert words["question answered"] >= 6

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import dataclasses
+from typing import Any
+
 import numpy as np
 import pytest
 
 from potserver.domain.dictionary import AtomDictionary
+from potserver.domain.types import Atom
 from potserver.mapping.matching import Matcher, Ranking, shared_centres
 from potserver.mapping.paper import PAPER
+from potserver.numerics.coupling import CouplingCosts, Ragged, coupling_costs
 from tests.conformance import reference
 
 RNG = np.random.default_rng(0)
@@ -72,3 +77,59 @@ def test_the_choice_depends_on_neither_threads_nor_the_company_of_other_sectors(
             other.rotation_rad,
             other.w2_m2,
         )
+
+
+def _turned(atom: Atom, number: int) -> Atom:
+    """An atom that looks a little like another."""
+    rng = np.random.default_rng(number)
+    shift = rng.normal(0.0, 1.0, 3).astype(np.float32)
+    return dataclasses.replace(
+        atom,
+        atom_id=f"{atom.atom_id}-{number}",
+        hit_points=atom.hit_points * np.float32(rng.uniform(0.5, 1.5)) + shift,
+        free_points=atom.free_points * np.float32(rng.uniform(0.5, 1.5)) + shift,
+    )
+
+
+@pytest.mark.parametrize("ranking", RANKINGS, ids=["default", "paper"])
+def test_what_a_scan_is_compared_with_does_not_grow_with_the_dictionary(
+    ranking: Ranking, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    posed: list[int] = []
+
+    def counted(sources: Ragged, targets: Ragged, pairs: Any, **options: Any) -> CouplingCosts:
+        posed.append(len(pairs))
+        return coupling_costs(sources, targets, pairs, **options)
+
+    monkeypatch.setattr("potserver.mapping.matching.coupling_costs", counted)
+    builtin = [atom for atom in AtomDictionary.builtin() if atom.dims == 3]
+    sectors = [reference.sector(HITS * s, FREE * s) for s in (0.7, 1.0, 1.3)] + [reference.sector(NONE, FREE)]
+    work = {}
+    for n in (0, 100, 300):
+        many = [*builtin, *(_turned(builtin[i % len(builtin)], i) for i in range(n))]
+        posed.clear()
+        assert all(_matcher(ranking, *many).match(sectors))
+        work[n] = sum(posed)
+    assert work[100] == work[300] <= ranking.n_compared * (2 * 3 + 1)
+    assert work[0] <= len(builtin) * len(ranking.rotations_deg) * (2 * 3 + 1)
+
+
+def test_of_many_atoms_the_nearest_ones_are_compared() -> None:
+    builtin = [atom for atom in AtomDictionary.builtin() if atom.dims == 3]
+    many = [*builtin, *(_turned(builtin[i % len(builtin)], i) for i in range(150))]
+    rng = np.random.default_rng(1)
+    picked = rng.choice(len(many), 40, replace=False)
+    # parts of atoms, as a scan sees them
+    sectors = [
+        reference.sector(
+            *(p[rng.permutation(len(p))[: len(p) // 2]] for p in (many[i].hit_points, many[i].free_points))
+        )
+        for i in picked
+    ]
+    bounded = _matcher(Ranking(), *many).match(sectors)
+    whole = _matcher(Ranking(n_compared=10**6), *many).match(sectors)
+    same = [
+        a is not None and b is not None and a.atom.atom_id == b.atom.atom_id
+        for a, b in zip(bounded, whole, strict=True)
+    ]
+    assert np.mean(same) > 0.9

@@ -5,6 +5,7 @@ No container engine is needed: the files are read, and the commands are asked fo
 
 from __future__ import annotations
 
+import itertools
 import json
 import re
 from collections.abc import Callable
@@ -78,23 +79,43 @@ def test_stages_that_are_copied_from_exist(dockerfile: Path) -> None:
 
 
 def test_the_base_image_is_pinned(dockerfile: Path) -> None:
-    images = [
-        instruction.rest.split()[0] for instruction in instructions(dockerfile) if instruction.word == "FROM"
+    found = instructions(dockerfile)
+    images = [instruction.rest.split()[0] for instruction in found if instruction.word == "FROM"]
+    assert set(images) == {"${BASE}"}, "whoever builds may name a digest"
+    (base,) = (rest for word, rest in found if word == "ARG" and rest.startswith("BASE="))
+    assert re.fullmatch(r"BASE=python:3\.\d+(\.\d+)?-slim-\w+(@sha256:[0-9a-f]{64})?", base), base
+
+
+def test_packages_are_pinned_by_hash(dockerfile: Path) -> None:
+    installs = [
+        command
+        for word, rest in instructions(dockerfile)
+        if word == "RUN"
+        for command in rest.split("&&")
+        if "pip install" in command
     ]
-    assert images
-    for image in images:
-        assert re.fullmatch(r"python:3\.\d+(\.\d+)?-slim-\w+(@sha256:[0-9a-f]{64})?", image), image
+    kinds = [
+        "hashed"
+        if "--no-deps --require-hashes -r locks/" in command
+        else "ours"
+        if command.endswith("--no-deps /dist/*.whl")
+        else command
+        for command in installs
+    ]
+    assert kinds == ["hashed", "hashed", "ours"]
 
 
-def test_packages_are_pinned_by_the_constraints(dockerfile: Path) -> None:
-    installs = [rest for word, rest in instructions(dockerfile) if word == "RUN" and "pip install" in rest]
-    assert installs
-    assert all("-c constraints.txt" in line for line in installs)
+def test_every_image_carries_a_bill_of_materials(dockerfile: Path) -> None:
+    runs = [rest for word, rest in instructions(dockerfile) if word == "RUN"]
+    (command,) = (rest for rest in runs if "cyclonedx-py environment" in rest)
+    place = command.split()[-1]
+    copied = [rest for word, rest in last_stage(dockerfile) if word == "COPY" and "--from=build" in rest]
+    assert any(place.startswith(f"{rest.split()[-1]}/") for rest in copied)
 
 
 def test_the_client_image_takes_the_client_only(root: Path) -> None:
     rest = " ".join(instruction.rest for instruction in instructions(root / "docker" / "client.Dockerfile"))
-    assert "./clients" in rest
+    assert "cd clients" in rest
     assert "potserver" not in rest
 
 
@@ -163,8 +184,54 @@ def test_image_tags_are_the_version(compose: dict) -> None:
 
 def test_the_server_container_keeps_its_maps_on_a_volume(compose: dict) -> None:
     server = compose["services"]["server"]
-    (volume,) = server["volumes"]
-    name, place = volume.split(":")
-    assert set(compose["volumes"]) == {name}
-    assert server["command"][server["command"].index("--store") + 1].startswith(f"{place}/")
+    places = dict(volume.split(":") for volume in server["volumes"])
+    assert set(compose["volumes"]) == set(places)
+    assert server["command"][server["command"].index("--store") + 1].startswith(f"{places['state']}/")
     assert server["stop_grace_period"] == "30s"
+
+
+def test_compiled_numerics_lie_apart_from_the_maps_for_the_server_alone(root: Path, compose: dict) -> None:
+    found = instructions(root / "docker" / "server.Dockerfile")
+    (cache,) = (match[1] for _, rest in found if (match := re.search(r"NUMBA_CACHE_DIR=(\S+)", rest)))
+    places = dict(volume.split(":") for volume in compose["services"]["server"]["volumes"])
+    assert cache.startswith(f"{places['cache']}/")
+    assert not cache.startswith(f"{places['state']}/")
+    (folders,) = (rest for word, rest in found if word == "RUN" and rest.startswith("install -d"))
+    made = folders.removeprefix("install -d -m 0700 -o potserver -g potserver ").split()
+    assert set(places.values()) == set(made)
+
+
+def test_memory_and_processes_are_bounded(root: Path, compose: dict) -> None:
+    for service in compose["services"].values():
+        assert re.fullmatch(r"\d+g", service["mem_limit"])
+        assert 0 < service["pids_limit"] < 10_000
+    unit = (root / "systemd" / "potserver.service").read_text()
+    assert {"MemoryMax=8G", "TasksMax=512", "CacheDirectoryMode=0700", "StateDirectoryMode=0700"} <= set(
+        unit.split()
+    )
+
+
+@pytest.mark.parametrize("name", ["server", "client", "dev", "build"])
+def test_locks_hold_the_versions_that_are_tested_and_a_hash_of_each(root: Path, name: str) -> None:
+    lines = (root / "locks" / f"{name}.txt").read_text().splitlines()
+    pins = [line for line in lines if line and not line.startswith((" ", "#"))]
+    assert pins
+    for pin, after in itertools.pairwise([*lines, ""]):
+        if pin in pins:
+            assert pin.endswith("\\"), pin
+            assert re.match(r"    --hash=sha256:[0-9a-f]{64}", after), pin
+    assert not [pin for pin in pins if re.match(r"(torch|triton|nvidia-|cuda-)", pin)], "see the Makefile"
+    locked = {(_normal(pin.split("==")[0]), pin.split()[0].split("==")[1]) for pin in pins}
+    constraints = [
+        line for line in (root / "constraints.txt").read_text().splitlines() if re.match(r"[A-Za-z]", line)
+    ]
+    allowed: dict[str, set[str]] = {}
+    for line in constraints:
+        package, version = re.split(r"==", line.split(";")[0].strip())
+        allowed.setdefault(_normal(package), set()).add(version)
+    assert {pair for pair in locked if pair[0] in allowed and pair[1] not in allowed[pair[0]]} == set()
+    assert not re.search(r"https?://|index-url|find-links", "\n".join(lines))
+
+
+def _normal(package: str) -> str:
+    return re.sub(r"[-_.]+", "-", package).lower()

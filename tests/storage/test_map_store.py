@@ -330,8 +330,11 @@ def test_a_saved_map_comes_back_with_another_epoch_and_a_higher_revision(
     assert_same_map(ours.state, again.state)
 
 
-def test_saved_maps_are_bounded_in_number(tmp_path: Path, open_map: OpenMap) -> None:
-    ours = open_map(tmp_path, max_saved=1)
+def test_saved_maps_are_bounded_in_number(
+    tmp_path: Path, open_map: OpenMap, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("potserver.storage.map_store.MAX_SAVED", 1)
+    ours = open_map(tmp_path)
     ours.store.save("a", ours.mapper, {})
     ours.store.save("a", ours.mapper, {})
     with pytest.raises(TooLargeError, match="the limit is 1"):

@@ -13,12 +13,12 @@ from potserver.limits import Limits
 
 def snapshot_fields(snapshot: KernelMap) -> dict[str, Any]:
     """What a snapshot says of itself."""
-    hinges = snapshot.kernels.hinge_mean
+    lower, upper = (None, None) if snapshot.box is None else snapshot.box.tolist()
     return {
         "map_revision": snapshot.map_revision,
-        "n_kernels": len(hinges),
-        "lower": hinges.min(axis=0).tolist() if len(hinges) else None,
-        "upper": hinges.max(axis=0).tolist() if len(hinges) else None,
+        "n_kernels": len(snapshot),
+        "lower": lower,
+        "upper": upper,
         **snapshot.rule.fields(),
     }
 

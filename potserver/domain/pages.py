@@ -1,0 +1,278 @@
+"""Pages: where a map's arrays lie that nobody changes any more, so that a year's map does not need a year's memory.
+
+They are written to a file without a name and mapped into memory: whoever reads them finds the very same numbers, and the
+system brings them in from the disk and takes their memory back as it needs to. So scans and questions know nothing of pages.
+The file ends with the process; nothing is ever read from it at a start. A disk that cannot read a page back ends the process,
+as a failing swap does; what was acknowledged is in the journal and the snapshot then.
+"""
+
+from __future__ import annotations
+
+import collections
+import dataclasses
+import mmap
+import os
+import tempfile
+import weakref
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from potserver.domain.map_part import MapPart
+from potserver.domain.tiles import Tile, TiledMap, TileIndex, part_of, tiles_of_part
+
+_PAGE = mmap.ALLOCATIONGRANULARITY
+_SEGMENT_BYTES = 256 * 2**20  # of the file are mapped at once; what was not written takes no room
+_ALIGNED = 64  # bytes: a line of the processor's cache
+_LEAST_BYTES = _ALIGNED  # smaller arrays would take no less on a page
+_READY_AT_ONCE = 64  # parts of a map that is read
+_AT_ONCE = 8 * 2**20  # bytes below the limit that are aimed at: snapshots are indexed anew each time
+
+
+class _Extent(np.ndarray[Any, np.dtype[np.uint8]]):
+    """A run of the file, mapped. A type of its own, so that arrays in it name it as their base and keep it alive: when the last
+    one is gone its place is free."""
+
+
+class _Run(NamedTuple):
+    start: int
+    n_bytes: int
+
+
+class PageFile:
+    """A file without a name that arrays are moved to. One caller at a time; arrays may be dropped by any thread."""
+
+    def __init__(self, folder: Path) -> None:
+        """Use a folder; the file is made when it is needed first."""
+        self._folder = folder
+        self._fd = -1
+        self._segments: list[tuple[int, mmap.mmap]] = []  # where each starts
+        self._end = 0  # of the file
+        self._free: list[_Run] = []  # by place, none beside another
+        self._dropped: collections.deque[_Run] = collections.deque()
+
+    def put(self, arrays: Sequence[NDArray[Any]]) -> dict[int, NDArray[Any]]:
+        """Move arrays, at least one, to the file.
+
+        Returns:
+            By `id` of each array: the same numbers on pages, as writeable as it was.
+        Raises:
+            OSError: the disk refuses; nothing was moved.
+        """
+        starts = np.cumsum([0, *(-(-array.nbytes // _ALIGNED) * _ALIGNED for array in arrays)]).tolist()
+        run = self._take(-(-starts[-1] // _PAGE) * _PAGE)
+        content = np.zeros(run.n_bytes, np.uint8)
+        for array, at in zip(arrays, starts, strict=False):
+            content[at : at + array.nbytes] = np.ascontiguousarray(array).reshape(-1).view(np.uint8)
+        try:
+            self._write(content, run.start)
+        except OSError:
+            self._dropped.append(run)
+            raise
+        start, segment = next(s for s in reversed(self._segments) if s[0] <= run.start)
+        extent = _Extent((run.n_bytes,), np.uint8, segment, run.start - start)
+        weakref.finalize(extent, self._dropped.append, run).atexit = False
+        moved: dict[int, NDArray[Any]] = {}
+        for array, at in zip(arrays, starts, strict=False):
+            moved[id(array)] = np.ndarray(array.shape, array.dtype, extent, at)
+            moved[id(array)].flags.writeable = array.flags.writeable
+        return moved
+
+    @property
+    def n_bytes(self) -> int:
+        """Of the file that are in use."""
+        return self._end - sum(run.n_bytes for run in (*self._free, *self._dropped))
+
+    def close(self) -> None:
+        """Write no more; arrays that were moved stay readable."""
+        if self._fd >= 0:
+            os.close(self._fd)
+            self._fd = -1
+
+    def _write(self, content: NDArray[np.uint8], at: int) -> None:
+        left = content.data
+        while left:
+            n = os.pwrite(self._fd, left, at)
+            left, at = left[n:], at + n
+
+    def _take(self, n_bytes: int) -> _Run:
+        self._collect()
+        number = next((i for i, run in enumerate(self._free) if run.n_bytes >= n_bytes), None)
+        if number is None:
+            self._grow(max(n_bytes, _SEGMENT_BYTES))
+            number = len(self._free) - 1
+        run = self._free[number]
+        self._free[number : number + 1] = (
+            [_Run(run.start + n_bytes, run.n_bytes - n_bytes)] if run.n_bytes > n_bytes else []
+        )
+        return _Run(run.start, n_bytes)
+
+    def _collect(self) -> None:
+        """Runs that were dropped are free, beside others they are one; none crosses segments."""
+        starts = {start for start, _ in self._segments}
+        runs = list(self._free)
+        while self._dropped:
+            runs.append(self._dropped.popleft())
+        self._free = []
+        for run in sorted(runs):
+            last = self._free[-1] if self._free else None
+            if last and last.start + last.n_bytes == run.start and run.start not in starts:
+                self._free[-1] = _Run(last.start, last.n_bytes + run.n_bytes)
+            else:
+                self._free.append(run)
+
+    def _grow(self, n_bytes: int) -> None:
+        if self._fd < 0:
+            self._fd, name = tempfile.mkstemp(dir=self._folder, prefix="pages-")
+            Path(name).unlink()  # a kill leaves nothing behind, and nobody can cut it off under us
+        os.ftruncate(self._fd, self._end + n_bytes)
+        self._segments.append((self._end, mmap.mmap(self._fd, n_bytes, offset=self._end)))
+        self._free.append(_Run(self._end, n_bytes))
+        self._end += n_bytes
+
+
+class Pages:
+    """Keeps one map's tiles in memory up to a limit, and moves to pages what was changed longest ago."""
+
+    def __init__(self, folder: Path, max_resident_bytes: int) -> None:
+        """Use a folder for the page file.
+
+        Args:
+            folder: On a disk.
+            max_resident_bytes: Of tiles, and what answers from them, that may stay in memory.
+        """
+        self.max_resident_bytes = max_resident_bytes
+        self.file = PageFile(folder)
+        self._seen: Mapping[TileIndex, MapPart] = {}
+        self._resident: dict[TileIndex, int] = {}  # bytes of each part, last changed last
+
+    def relieve(self, tiled: TiledMap) -> TiledMap:
+        """The same map with its coldest parts on pages, if it has more in memory than it may; else the one that was given.
+
+        Raises:
+            OSError: the disk refuses; the map is as it was.
+        """
+        self._look(tiled)
+        n_bytes = sum(self._resident.values())
+        if n_bytes <= self.max_resident_bytes:
+            return tiled
+        tiles, parts = dict(tiled.tiles), dict(tiled.parts)
+        moved = []
+        for number, of_part in self._resident.items():
+            if n_bytes <= max(self.max_resident_bytes - _AT_ONCE, 0):
+                break
+            members = {index: tiles[index] for index in tiles_of_part(number) if index in tiles}
+            tiles_now, parts[number] = self._move(tuple(members.values()), parts[number])
+            tiles.update(zip(members, tiles_now, strict=True))
+            moved.append(number)
+            n_bytes -= of_part
+        for number in moved:
+            del self._resident[number]
+        self._seen = parts
+        return tiled._replace(tiles=tiles, parts=parts)
+
+    def keep(self, tile: Tile) -> Tile:
+        """A tile of a map that is being read, on pages.
+
+        Raises:
+            OSError: the disk refuses.
+        """
+        arrays = _in_memory(tile)
+        return _exchanged(tile, dict(self.file.put(arrays))) if arrays else tile
+
+    def gather(self, empty: TiledMap, tiles: Mapping[TileIndex, Tile]) -> TiledMap:
+        """A map of tiles that were read: made ready some parts at a time, so that it never takes more than it may.
+
+        Raises:
+            OSError: the disk refuses.
+        """
+        by_part: dict[TileIndex, dict[TileIndex, Tile]] = {}
+        for index, tile in tiles.items():
+            by_part.setdefault(part_of(index), {})[index] = tile
+        tiled, parts = empty, list(by_part.values())
+        for start in range(0, len(parts), _READY_AT_ONCE):
+            some = parts[start : start + _READY_AT_ONCE]
+            tiled = self.relieve(
+                tiled.with_tiles({index: tile for part in some for index, tile in part.items()})
+            )
+        return tiled._replace(
+            tiles={index: tiled.tiles[index] for index in tiles}
+        )  # in the order of the file
+
+    def close(self) -> None:
+        """Move no more; what is on pages stays readable."""
+        self.file.close()
+
+    def _look(self, tiled: TiledMap) -> None:
+        """Note which parts have changed since the last time, and what they take."""
+        for number, part in tiled.parts.items():
+            if self._seen.get(number) is not part:
+                self._resident.pop(number, None)
+                members = [tiled.tiles[index] for index in tiles_of_part(number) if index in tiled.tiles]
+                n_bytes = sum(array.nbytes for array in _in_memory(members, *_heavy(part)))
+                if n_bytes:
+                    self._resident[number] = n_bytes
+        for number in [number for number in self._resident if number not in tiled.parts]:
+            del self._resident[number]
+        self._seen = tiled.parts
+
+    def _move(self, tiles: tuple[Tile, ...], part: MapPart) -> tuple[tuple[Tile, ...], MapPart]:
+        new = self.file.put(_in_memory(tiles, *_heavy(part)))
+        return _exchanged((tiles, part), dict(new))
+
+
+def _heavy(part: MapPart) -> Iterator[object]:
+    """What of a part is read where it is asked; the places of its bricks are read whenever a map is indexed, and stay."""
+    yield part.members
+    yield part.rest
+    yield part.lookup
+    for bricks in part.bricks:
+        yield bricks.rows, bricks.row_of
+
+
+def _in_memory(*things: object) -> list[NDArray[Any]]:
+    """The arrays of records that are worth a move and not on pages yet, each once."""
+    found: dict[int, NDArray[Any]] = {}
+    left = list(things)
+    while left:
+        thing = left.pop()
+        if isinstance(thing, np.ndarray):
+            if thing.nbytes >= _LEAST_BYTES and not _is_paged(thing):
+                found[id(thing)] = thing
+        elif isinstance(thing, tuple | list):
+            left.extend(thing)
+        elif dataclasses.is_dataclass(thing):
+            left.extend(getattr(thing, field.name) for field in dataclasses.fields(thing))
+    return list(found.values())
+
+
+def _is_paged(array: NDArray[Any]) -> bool:
+    base: object = array
+    while isinstance(base, np.ndarray):
+        if isinstance(base, _Extent):
+            return True
+        base = base.base
+    return False
+
+
+def _exchanged(thing: Any, new: dict[int, Any]) -> Any:
+    """A record with other objects in the place of those named by `id`; what two of its fields share stays shared."""
+    if id(thing) in new:
+        return new[id(thing)]
+    made = thing
+    if isinstance(thing, tuple):
+        fields = [_exchanged(field, new) for field in thing]
+        if any(a is not b for a, b in zip(thing, fields, strict=True)):
+            made = type(thing)._make(fields) if hasattr(thing, "_make") else tuple(fields)
+    elif dataclasses.is_dataclass(thing):
+        names = [field.name for field in dataclasses.fields(thing)]
+        values = [_exchanged(getattr(thing, name), new) for name in names]
+        if any(getattr(thing, name) is not value for name, value in zip(names, values, strict=True)):
+            made = object.__new__(type(thing))  # what was checked before needs no check
+            for name, value in zip(names, values, strict=True):
+                object.__setattr__(made, name, value)
+    new[id(thing)] = made
+    return made

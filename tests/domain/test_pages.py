@@ -1,0 +1,121 @@
+"""Pages: what lies on them is the same to the bit, and their places are used again."""
+
+from __future__ import annotations
+
+import gc
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from potserver.domain.pages import PageFile, Pages
+from potserver.domain.tiles import TiledMap, part_of
+from potserver.domain.types import Scan, yaw_pose
+from potserver.mapping.service import MappingService
+from potserver.mapping.settings import MappingSettings
+from potserver.storage.tile_codec import encode_tile
+
+SETTINGS = MappingSettings(max_range_m=12.0, beams_per_scan=300)
+QUESTIONS = np.random.default_rng(7).uniform([-10, -8, -1], [250, 8, 2], (4000, 3))
+
+
+def scan_at(x_m: float, seq: int) -> Scan:
+    """A small room, seen from its middle."""
+    rng = np.random.default_rng(seq)
+    angle = rng.uniform(-np.pi, np.pi, 300)
+    points = np.stack([6 * np.cos(angle), 5 * np.sin(angle), rng.uniform(-1, 2, 300)], axis=1)
+    return Scan(
+        points=points.astype(np.float32), T_map_sensor=yaw_pose(x_m, 0.0, 0.0), robot_id="r1", seq=seq
+    )
+
+
+def bytes_of(tiled: TiledMap | None) -> dict[tuple[int, int, int], bytes]:
+    assert tiled is not None
+    return {index: encode_tile(index, tile) for index, tile in tiled.tiles.items()}
+
+
+def test_arrays_on_pages_are_the_same_and_as_writeable_as_before(tmp_path: Path) -> None:
+    file = PageFile(tmp_path)
+    one, other = np.arange(5000.0), np.arange(3000, dtype=np.int16).reshape(-1, 3)[:, ::-1]
+    other.flags.writeable = False
+    moved = file.put([one, other])
+    np.testing.assert_array_equal(moved[id(one)], one)
+    np.testing.assert_array_equal(moved[id(other)], other)
+    assert (moved[id(one)].flags.writeable, moved[id(other)].flags.writeable) == (True, False)
+    assert list(tmp_path.iterdir()) == [], "the file has no name"
+    file.close()
+    np.testing.assert_array_equal(moved[id(one)], one)
+
+
+def test_the_place_of_what_was_dropped_is_used_again(tmp_path: Path) -> None:
+    file = PageFile(tmp_path)
+    array = np.ones(100_000)
+    kept = [file.put([array]) for _ in range(3)]
+    in_use = file.n_bytes
+    assert in_use >= 3 * array.nbytes
+    for _ in range(2000):  # ten times the first segment
+        file.put([array])
+    gc.collect()
+    assert file.n_bytes == in_use
+    del kept
+    gc.collect()
+    assert file.n_bytes == 0
+    again = file.put([array])
+    np.testing.assert_array_equal(next(iter(again.values())), array)
+
+
+def test_a_map_on_pages_answers_to_the_bit_and_goes_on_as_one_in_memory(tmp_path: Path) -> None:
+    in_memory, paged = (MappingService(settings=SETTINGS, threads=1) for _ in range(2))
+    pages = Pages(tmp_path, 1)
+    for seq, x_m in enumerate((0.0, 60.0, 120.0, 180.0, 240.0, 3.0, 62.0)):
+        for mapper in (in_memory, paged):
+            mapper.integrate(scan_at(x_m, seq))
+        before = paged.snapshot
+        paged.relieve(pages)
+        assert paged.snapshot is not before
+        wanted = in_memory.snapshot.occupancy_with_gradient(QUESTIONS)
+        for answer in (before, paged.snapshot):  # who still has the old snapshot is answered too
+            got = answer.occupancy_with_gradient(QUESTIONS)
+            for name in ("mean", "var", "latent_mean", "latent_var", "observed", "gradient"):
+                np.testing.assert_array_equal(getattr(got, name), getattr(wanted, name))
+        assert paged.snapshot.map_revision == in_memory.snapshot.map_revision
+    assert bytes_of(paged.state.tiled) == bytes_of(in_memory.state.tiled)
+    for mapper in (in_memory, paged):
+        mapper.merge(mapper.state, yaw_pose(0.0, 40.0, 0.0))
+        mapper.integrate(scan_at(10.0, 8))
+        mapper.integrate(
+            Scan(points=scan_at(0.0, 9).points, T_map_sensor=yaw_pose(1.0, 0.0, 0.0), robot_id="r2", seq=9)
+        )
+        paged.relieve(pages)
+        mapper.remove_robot("r2")
+    assert bytes_of(paged.state.tiled) == bytes_of(in_memory.state.tiled)
+
+
+def test_the_coldest_parts_leave_memory_first(tmp_path: Path) -> None:
+    mapper = MappingService(settings=SETTINGS, threads=1)
+    pages = Pages(tmp_path, 10**9)
+    for seq, x_m in enumerate((0.0, 120.0, 240.0, 0.0)):
+        mapper.integrate(scan_at(x_m, seq))
+        mapper.relieve(pages)
+    assert pages.file.n_bytes == 0, "there is room for all"
+    assert mapper.state.tiled is not None
+    order = [number[0] for number in pages._resident]
+    where = [
+        part_of(mapper.state.tiled.grid.index_of(np.array([x, 0.0, 0.0])))[0] for x in (120.0, 240.0, 0.0)
+    ]
+    assert [x for x in order if x in where][-1] == where[-1], "what was changed last leaves last"
+    assert order.index(where[0]) < order.index(where[1]) < order.index(where[2])
+    before = sum(pages._resident.values())
+    pages.max_resident_bytes = 1
+    mapper.relieve(pages)
+    assert pages._resident == {}
+    assert before <= pages.file.n_bytes < 1.5 * before
+
+
+def test_a_disk_that_refuses_leaves_the_map_in_memory(tmp_path: Path) -> None:
+    mapper = MappingService(settings=SETTINGS, threads=1)
+    mapper.integrate(scan_at(0.0, 0))
+    state = mapper.state
+    with pytest.raises(OSError, match="No such file"):
+        mapper.relieve(Pages(tmp_path / "gone", 1))
+    assert mapper.state is state
