@@ -126,7 +126,9 @@ class KernelMap:
 
     def with_parts(self, parts: Sequence[MapPart]) -> KernelMap:
         """The same map from parts that hold the same kernels elsewhere."""
-        return KernelMap(parts, rule=self.rule, map_revision=self.map_revision, threads=self._threads)
+        return KernelMap(
+            parts, rule=self.rule, map_revision=self.map_revision, threads=self._threads, lean=self.lean
+        )
 
     def __len__(self) -> int:
         return self._n_kernels

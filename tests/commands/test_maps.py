@@ -85,7 +85,8 @@ def test_info_of_a_store_lists_its_maps_and_their_journals(tmp_path: Path, run: 
         store.save("copy" if map_id == "roof" else None, service, {})
         for number in range(n):
             scan = make_scan(number)
-            service.integrate(scan, commit=lambda store=store, scan=scan: store.append(scan))
+            with store.keeping(scan) as commit:
+                service.integrate(scan, commit=commit)
         shutil.copytree(
             tmp_path / "store" / map_id, tmp_path / "killed" / map_id
         )  # as a kill would leave it now
@@ -119,7 +120,8 @@ def test_a_store_that_a_server_has_open_is_read_and_said_to_be_in_use(tmp_path: 
 
     def take(number: int) -> None:
         scan = make_scan(number)
-        service.integrate(scan, commit=lambda: store.append(scan))
+        with store.keeping(scan) as commit:
+            service.integrate(scan, commit=commit)
         store.advance(service, {})
 
     take(1)
@@ -290,7 +292,8 @@ def test_a_snapshot_is_rescued_from_a_store(tmp_path: Path, run: Run) -> None:
     store.restore(service)
     for number in (1, 2):
         scan = make_scan(number)
-        service.integrate(scan, commit=lambda scan=scan: store.append(scan))
+        with store.keeping(scan) as commit:
+            service.integrate(scan, commit=commit)
         if number == 1:
             store.save(None, service, {"r1": {"": scan.seq}})
             first = service.state

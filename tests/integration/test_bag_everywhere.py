@@ -112,5 +112,5 @@ def see_as_a_costmap(server: MapServer, client: MapClient) -> None:
         nodes.close()
     values = grid.data.reshape(grid.info.height, grid.info.width)
     assert np.abs(values - expected_grid(client, grid)).max() <= 1  # percent: rounding
-    assert (values > 90).sum() > 100
+    assert (values >= 65).sum() > 100  # what a planner takes for occupied by map_server's default
     assert (values == -1).any()

@@ -111,7 +111,7 @@ def test_updates_carry_the_tiles_that_changed_and_no_others(site: Site) -> None:
 def test_a_map_that_leans_is_mirrored_with_its_lean(site: Site) -> None:
     rng = np.random.default_rng(4)
     ground = np.column_stack([rng.uniform(-9, 9, (500, 2)), np.full(500, -1.6)]).astype(np.float32)
-    mirror = site.client.mirror()
+    mirror = site.client.mirror(step=None)
     for n, x in enumerate((0.0, 40.0)):
         pose = np.eye(4)
         pose[0, 3] = x
@@ -161,7 +161,7 @@ def test_weights_in_steps_take_few_bytes_and_say_nearly_the_same(site: Site) -> 
     exact, short = site.client.mirror(step=None), site.client.mirror()
     assert short.update().n_bytes < 0.5 * exact.update().n_bytes
     site.scan(0.5)  # most nodes stay, and their weights change a little
-    assert short.update().n_bytes < 0.4 * exact.update().n_bytes
+    assert short.update().n_bytes < 0.45 * exact.update().n_bytes  # leans travel whole in both
     here, there = short.occupancy(POINTS), site.client.occupancy(POINTS)
     both = here.observed & there.observed
     change = np.abs(here.mean - there.mean)[both]

@@ -50,11 +50,13 @@ struct PointsQuery {  // pot.points_query.v1
     Array points;     // (N, 3) float32 or float64, m, map frame
     std::optional<double> deadline_ms;
     std::optional<bool> with_gradient;
+    std::optional<bool> evidence_only;  // true: what is not observed is unknown
 };
 
 struct Occupancy {  // pot.occupancy.v1, without gradients
     Array mean, var, latent_mean, latent_var, observed;
     int64_t map_revision = 0;
+    std::optional<Array> borrowed;  // (N,) float32: how much of each answer the dictionary expects and no evidence says
 };
 
 struct Receipt {  // pot.receipt.v1, the fields that a robot acts on
@@ -123,14 +125,16 @@ inline Cloud read_cloud(const Bytes& bytes) {
 inline PointsQuery read_points_query(const Bytes& bytes) {
     const auto handle = unpacked(bytes);
     const Fields f = fields_of(handle.get());
-    return {required_array(f, "points"), optional<double>(f, "deadline_ms"), optional<bool>(f, "with_gradient")};
+    return {required_array(f, "points"), optional<double>(f, "deadline_ms"), optional<bool>(f, "with_gradient"),
+            optional<bool>(f, "evidence_only")};
 }
 
 inline Occupancy read_occupancy(const Bytes& bytes) {
     const auto handle = unpacked(bytes);
     const Fields f = fields_of(handle.get());
     return {required_array(f, "mean"),       required_array(f, "var"),      required_array(f, "latent_mean"),
-            required_array(f, "latent_var"), required_array(f, "observed"), required<int64_t>(f, "map_revision")};
+            required_array(f, "latent_var"), required_array(f, "observed"), required<int64_t>(f, "map_revision"),
+            optional_array(f, "borrowed")};
 }
 
 inline Receipt read_receipt(const Bytes& bytes) {
@@ -203,16 +207,18 @@ inline Bytes written(const Cloud& c) {
 }
 
 inline Bytes written(const PointsQuery& q) {
-    Writer writer(q.with_gradient ? 3 : 2);
+    Writer writer(2 + (q.with_gradient ? 1 : 0) + (q.evidence_only ? 1 : 0));
     writer.field("points", q.points).field("deadline_ms", q.deadline_ms);
     if (q.with_gradient) writer.field("with_gradient", *q.with_gradient);
+    if (q.evidence_only) writer.field("evidence_only", *q.evidence_only);
     return writer.bytes();
 }
 
 inline Bytes written(const Occupancy& o) {
-    Writer writer(6);
+    Writer writer(o.borrowed ? 7 : 6);
     writer.field("mean", o.mean).field("var", o.var).field("latent_mean", o.latent_mean);
     writer.field("latent_var", o.latent_var).field("observed", o.observed).field("map_revision", o.map_revision);
+    if (o.borrowed) writer.field("borrowed", *o.borrowed);
     return writer.bytes();
 }
 
