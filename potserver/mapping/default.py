@@ -69,7 +69,7 @@ class DefaultPipeline(Pipeline):
         """The scan's own map and the overall map's new tiles, worked out at the same time."""
         return parallel_pair(
             lambda: self.own_map(seen, carrier, tiled.grid.fine_m, clock),
-            lambda: self.fuse(tiled, look, KernelSet.empty(), moment, clock),
+            lambda: self.fuse(tiled, look, moment, clock),
             self.threads,
         )
 
@@ -85,12 +85,10 @@ class DefaultPipeline(Pipeline):
         """What one sector's carried kernels are worth before the scan's labels."""
         return borrowed_prior(carried, w2_m2)
 
-    def fuse(
-        self, tiled: TiledMap, look: Look, carried: KernelSet, moment: Moment, clock: Stopwatch
-    ) -> Fused:
+    def fuse(self, tiled: TiledMap, look: Look, moment: Moment, clock: Stopwatch) -> Fused:
         """The overall map's tiles with the scan in them."""
         with clock("fuse"):
-            return fuse(tiled, look, carried, self.fusion, moment, threads=self.threads)
+            return fuse(tiled, look, self.fusion, moment, threads=self.threads)
 
     def age(self, tiled: TiledMap, fused: Fused, moment: Moment) -> tuple[TiledMap, Fused]:
         """The map with its stalest part fitted again, if evidence ages."""

@@ -35,7 +35,7 @@ from potserver.mapping.surfaces import FACE_SAMPLES, FaceSamples, Samples, surfa
 from potserver.numerics import evidence
 from potserver.numerics.arrays import UInt8
 from potserver.numerics.beams import Beams, LabelledPoints, beam_weights
-from potserver.numerics.feature_blocks import Blocks, feature_blocks, gradient_and_diagonal, two_diagonals
+from potserver.numerics.feature_blocks import Blocks, feature_blocks, two_diagonals
 from potserver.numerics.geometry import bounds, inside_box
 from potserver.numerics.lattice_nodes import new_nodes
 from potserver.numerics.warm_fit import Prior, Solver, warm_fit
@@ -43,8 +43,6 @@ from potserver.numerics.warm_fit import Prior, Solver, warm_fit
 _FINEST_M, _COARSEST_M, _FINE_PER_RANGE = 0.2, 0.4, 1.0 / 20.0
 _COARSE_REACH = 0.7  # spacings: nearer coarse nodes than this get a kernel, see lattice_nodes.new_nodes
 _FINE_REACH = 0.9  # the same for fine nodes about hits, so that faces have nodes on both sides
-_TOO_WIDE = 1.5  # coarse spacings
-_REACHED = 0.1  # activation by a carried kernel below which a point or a row is not its own
 _EXPLAINED = 1.0  # activation by carried kernels at which the lattice adds none
 _LONGEST_STEP = 4.0  # Newton steps
 _UNSUPPORTED = 1e-5  # of a kernel's curvature: what no row within its reach leaves
@@ -141,7 +139,6 @@ def grid_for(beams: Beams, tile_size_m: float, resolution_m: float = 0.0) -> Til
 def fuse(
     tiled: TiledMap,
     look: Look,
-    carried: KernelSet,
     options: FusionOptions,
     moment: Moment,
     *,
@@ -152,7 +149,6 @@ def fuse(
     Args:
         tiled: The map; it is not changed.
         look: The scan.
-        carried: Transported kernels that may join, map frame; their weights and variances are a prior. Mostly none.
         options: How.
         moment: Of the change.
         threads: Threads of the solve.
@@ -171,19 +167,11 @@ def fuse(
         region.lean |= lean_of_tiles(look.expected, unseen, grid)
     samples = _samples_of(look, region, options, threads)
     new_rows = add_evidence(region, samples, look.source, within=inside, turn=moment.revision)
-    taken = KernelSet.empty()
-    if len(carried):
-        points = look.labelled.points - region.origin_m
-        taken = _wanted(carried.moved(-region.origin_m), region.kernels, points, grid, threads)
-        # samples may count at a row that a narrow kernel does not reach: the solve would only drop it
-        where = evidence.positions(region.rows, grid.fine_m)
-        taken = taken.take(_support(taken, where, grid, threads) >= _REACHED)
-    added = add_kernels(region, new_rows, MapKernels.new(taken, CARRIED), options, look.is_planar, threads)
+    none = MapKernels.new(KernelSet.empty(), CARRIED)
+    added = add_kernels(region, new_rows, none, options, look.is_planar, threads)
     fitted = _fit(region, *inside, options, threads)
-    return Fused(
-        region.tiles(lower, upper, revision=moment.revision, stamp_ns=moment.stamp_ns),
-        len(added), int((added.level == CARRIED).sum()), fitted,
-    )  # fmt: skip
+    tiles = region.tiles(lower, upper, revision=moment.revision, stamp_ns=moment.stamp_ns)
+    return Fused(tiles, len(added), n_transported=0, converged=fitted)
 
 
 def _samples_of(look: Look, region: Region, options: FusionOptions, threads: int) -> Samples:
@@ -317,37 +305,6 @@ def add_kernels(
     )
     region.kernels = MapKernels.concatenate([present, added])
     return added
-
-
-def _wanted(
-    carried: KernelSet, present: MapKernels, points: Float64, grid: TileGrid, threads: int
-) -> KernelSet:
-    """The transported kernels that the map takes: where the scan has data for them and no atom has explained them before.
-
-    Those much wider than the map's own are left out, they would only make the solve harder.
-    """
-    carried = carried.take(carried.gamma >= gamma_of_spacing(_TOO_WIDE * grid.coarse_m))
-    if len(carried) == 0:
-        return carried
-    carried = carried.take(_support(carried, points, grid, threads) >= 1.0)
-    before = present.kernels.take(present.level == CARRIED)
-    explained = np.zeros(len(carried), bool)
-    for fine in (False, True):
-        members = _is_fine(carried, grid) == fine
-        same_scale = before.take(_is_fine(before, grid) == fine)
-        explained[members] = (
-            activation(same_scale, carried.hinge_mean[members], threads=threads) >= _EXPLAINED
-        )
-    return carried.take(~explained)
-
-
-def _support(kernels: KernelSet, points: Float64, grid: TileGrid, threads: int) -> Float32:
-    """(K,) sum of phi over (N, 3) points, for each kernel."""
-    blocks = feature_blocks(
-        points, kernels.hinge_mean, kernels.gamma, edge_m=grid.coarse_m, cut=_REACHED, threads=threads
-    )
-    ones = np.ones(len(points), np.float32)
-    return gradient_and_diagonal(blocks, ones, ones, threads=threads)[0]
 
 
 def _is_fine(kernels: KernelSet, grid: TileGrid) -> Bool:
