@@ -174,7 +174,7 @@ class _State:
     @property
     def revisions(self) -> dict[TileIndex, int]:
         """Of all tiles that are held."""
-        held: list[Mapping[TileIndex, Any]] = [self.tiles, self.leans]
+        held: list[Mapping[TileIndex, Any]] = [self.leans, self.tiles]  # a lean that stayed may be older
         return {index: tile.revision for tiles in held for index, tile in tiles.items()}
 
     @property
@@ -234,6 +234,8 @@ class _Reply:
         gone = self._gone(held)
         changed = came.keys() | leans_came.keys()
         stays = held.keys() - set(gone) - changed
+        # told by changes, a tile keeps its lean unless another comes
+        leaning = held.keys() - set(gone) if first.changes is not ABSENT else stays
         tiles, leans = ({}, {}) if state is None else (state.tiles, state.leans)
         now = _State(
             epoch=first.epoch,
@@ -241,7 +243,7 @@ class _Reply:
             rule=rule,
             tile_size_m=first.tile_size_m,
             tiles={index: tile for index, tile in tiles.items() if index in stays} | came,
-            leans={index: lean for index, lean in leans.items() if index in stays} | leans_came,
+            leans={index: lean for index, lean in leans.items() if index in leaning} | leans_came,
         )
         n_removed = len(before.keys() - now.revisions.keys())
         return now, MirrorUpdate(

@@ -16,7 +16,7 @@ import numpy as np
 from potserver.asking.lattices import LEAST_ON_LATTICE, distinct_rows, lattice_of, shapes_of
 from potserver.domain.tiles import TileIndex
 from potserver.domain.types import Float32, Float64, KernelSet
-from potserver.numerics.arrays import Int64
+from potserver.numerics.arrays import Int64, UInt8
 
 _MOST_NODES = 2**40  # of a lattice in a tile: numbers of nodes of many tiles fit into 63 bits
 _LEAST_VAR = 2.0**-126
@@ -58,6 +58,7 @@ class TileCodes(NamedTuple):
 
     nodes: Mapping[Lattice, NodeCodes]
     others: KernelSet  # that stand on no lattice, as they are
+    lean: UInt8 | None = None  # of the tile, which was told with its kernels
 
     @property
     def n_kernels(self) -> int:
@@ -152,10 +153,15 @@ class TileMemory:
             if key in self._codes:
                 return
             self._codes[key] = codes
-            self._n_kernels += codes.n_kernels
+            self._n_kernels += _worth(codes)
             while self._n_kernels > self._most:
                 _, old = self._codes.popitem(last=False)
-                self._n_kernels -= old.n_kernels
+                self._n_kernels -= _worth(old)
+
+
+def _worth(codes: TileCodes) -> int:
+    """What codes take, in kernels: a tile without any has a lean."""
+    return max(codes.n_kernels, 1)
 
 
 def shape_of(lattice: Lattice) -> Float32:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from potschemas.answers import AnswerRule
-from potschemas.lean import LeanTiles
+from potschemas.lean import LEAN_ZERO, LeanTiles
 from potserver.asking.plan import Plan, checked_box, pieces
 from potserver.asking.tile_codes import Steps, TileCodes, TileKey, TileMemory, code_tile
 from potserver.domain.map_state import MapState
@@ -18,7 +18,7 @@ from potserver.domain.tiles import Tile, TileIndex
 from potserver.domain.types import KernelSet
 from potserver.errors import BadPointsError, ShapeError, TooLargeError
 from potserver.limits import Limits
-from potserver.numerics.arrays import Int64
+from potserver.numerics.arrays import Int64, UInt8
 
 LEAST_STEP, MOST_STEP = 1e-4, 10.0  # log-odds
 PART_KERNELS = 20_000  # of a part: 200 kB on the wire, at most 800; askers take up to MAX_PART_KERNELS
@@ -187,6 +187,7 @@ class TilesPlan(Plan[TileRun]):
             codes = coding.memory.get(key)
             if codes is None:
                 codes = code_tile(tile.kernels.kernels, self.spacings_m, self.tile_size_m, coding.steps)
+                codes = codes._replace(lean=tile.lean)
                 coding.memory.put(key, codes)
             changes.append(Change(codes, coding.bases[t]))
         return self._run(i, members, [c.codes.others for c in changes])._replace(changes=tuple(changes))
@@ -201,12 +202,27 @@ class TilesPlan(Plan[TileRun]):
         )
 
     def _leans(self, i: int) -> Leans | None:
-        """Those that travel with a part: each tile's once."""
-        leaning = [(index, tile) for index, tile in self.tiles if tile.lean is not None][i :: self.n_parts]
-        if not leaning:
+        """Those that travel with a part: each tile's once, and with a coding only those that the asker has not."""
+        told = [(t, lean) for t in range(len(self.tiles)) if (lean := self._lean_to_tell(t)) is not None]
+        if not (mine := told[i :: self.n_parts]):
             return None
-        nodes = {index: tile.lean for index, tile in leaning if tile.lean is not None}
-        return Leans(LeanTiles(self.tile_size_m, nodes), tuple(tile.revision for _, tile in leaning))
+        nodes = {self.tiles[t][0]: lean for t, lean in mine}
+        return Leans(LeanTiles(self.tile_size_m, nodes), tuple(self.tiles[t][1].revision for t, _ in mine))
+
+    def _lean_to_tell(self, t: int) -> UInt8 | None:
+        index, tile = self.tiles[t]
+        if self.coding is None:
+            return tile.lean
+        if not len(tile.kernels):  # it is in no run, and told by its lean alone
+            key = TileKey(self.epoch, index, tile.revision, self.coding.steps)
+            self.coding.memory.put(key, TileCodes({}, KernelSet.empty(), tile.lean))
+        base = self.coding.bases[t]
+        if base is None or base.lean is None:
+            return tile.lean
+        if tile.lean is None:
+            return np.full_like(base.lean, LEAN_ZERO)
+        is_known = np.array_equal(base.lean, tile.lean) and (len(tile.kernels) or not base.n_kernels)
+        return None if is_known else tile.lean
 
 
 def _present(tiles: Mapping[TileIndex, Tile], low: Int64 | None, high: Int64 | None) -> dict[TileIndex, Tile]:

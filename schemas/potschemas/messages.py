@@ -455,7 +455,7 @@ class TilesPart(Message, frozen=True, kw_only=True):
     residual_var: Finite  # log-odds^2, added in the measure that this sum falls short of 1
     mean_moderation: Finite  # share of the latent variance that pulls the mean towards 0.5
     changes: TileChanges | Absent = ABSENT  # where the query has a step
-    lean: Lean | Absent = ABSENT  # of a map that leans: of some tiles that differ, each once in the reply
+    lean: Lean | Absent = ABSENT  # of tiles that differ; with `changes` of those where it is new
 
 
 class AtomInfo(msgspec.Struct, frozen=True, kw_only=True):
