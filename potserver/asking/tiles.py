@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping, Sequence
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -147,7 +148,7 @@ class Leans(NamedTuple):
     revisions: tuple[int, ...]
 
 
-@dataclasses.dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+@dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
 class TilesPlan(Plan[TileRun]):
     """The tiles that differ from what the asker has."""
 
@@ -203,11 +204,14 @@ class TilesPlan(Plan[TileRun]):
 
     def _leans(self, i: int) -> Leans | None:
         """Those that travel with a part: each tile's once, and with a coding only those that the asker has not."""
-        told = [(t, lean) for t in range(len(self.tiles)) if (lean := self._lean_to_tell(t)) is not None]
-        if not (mine := told[i :: self.n_parts]):
+        if not (mine := self._told_leans[i :: self.n_parts]):
             return None
         nodes = {self.tiles[t][0]: lean for t, lean in mine}
         return Leans(LeanTiles(self.tile_size_m, nodes), tuple(self.tiles[t][1].revision for t, _ in mine))
+
+    @cached_property
+    def _told_leans(self) -> list[tuple[int, UInt8]]:
+        return [(t, lean) for t in range(len(self.tiles)) if (lean := self._lean_to_tell(t)) is not None]
 
     def _lean_to_tell(self, t: int) -> UInt8 | None:
         index, tile = self.tiles[t]

@@ -306,6 +306,11 @@ class Region:
         )  # fmt: skip
 
     @property
+    def size(self) -> NDArray[np.int64]:
+        """(3,) tiles along the axes."""
+        return np.asarray(self.upper, np.int64) - np.asarray(self.lower, np.int64) + 1
+
+    @property
     def origin_m(self) -> Float64:
         """(3,) m, map frame."""
         return np.asarray(self.lower, np.float64) * self.grid.size_m
@@ -320,7 +325,7 @@ class Region:
             revision, stamp_ns: Of the new tiles.
         """
         low, high = self.grid.index_of(lower_m), self.grid.index_of(upper_m)
-        size = np.asarray(self.upper, np.int64) - np.asarray(self.lower, np.int64) + 1
+        size = self.size
         rows, row_cuts = self._rows_by_tile(size)
         hinge = self.kernels.kernels.hinge_mean
         # rounding may put a kernel of the outermost tiles just outside
@@ -358,7 +363,7 @@ class Region:
     def unseen_tiles(self, lower_m: Float64, upper_m: Float64) -> list[TileIndex]:
         """The tiles that a box touches, (3,) m, map frame, and that no evidence is in."""
         low, high = self.grid.index_of(lower_m), self.grid.index_of(upper_m)
-        size = np.asarray(self.upper, np.int64) - np.asarray(self.lower, np.int64) + 1
+        size = self.size
         is_seen = np.zeros(int(size.prod()), bool)
         is_seen[tile_of(self.rows, self.grid.voxels, size)[0]] = True
         seen = is_seen.reshape(tuple(size))

@@ -113,23 +113,23 @@ def gradient_and_diagonal(
     blocks: Blocks, residual: Float32, curvature: Float32, *, threads: int = 1
 ) -> tuple[Float32, Float32]:
     """(K,) Phi^T r and (K,) diagonal of Phi^T diag(curvature) Phi, in one pass."""
-    parts = parallel_map(
-        lambda b: _gradient(b, blocks.unit, residual, curvature, blocks.n_kernels),
-        blocks.parts,
-        threads,
-    )
-    total = np.zeros((2, blocks.n_kernels), np.float32)
-    for part in parts:
-        total += part
-    return total[0], total[1]
+    return _summed(blocks, residual, curvature, False, threads)
 
 
 def two_diagonals(
     blocks: Blocks, one: Float32, other: Float32, *, threads: int = 1
 ) -> tuple[Float32, Float32]:
     """(K,) diagonals of Phi^T diag(one) Phi and of Phi^T diag(other) Phi, in one pass."""
+    return _summed(blocks, one, other, True, threads)
+
+
+def _summed(
+    blocks: Blocks, one: Float32, other: Float32, are_both_squares: bool, threads: int
+) -> tuple[Float32, Float32]:
     parts = parallel_map(
-        lambda b: _two_diagonals(b, blocks.unit, one, other, blocks.n_kernels), blocks.parts, threads
+        lambda b: _sums_of_kernels(b, blocks.unit, one, other, are_both_squares, blocks.n_kernels),
+        blocks.parts,
+        threads,
     )
     total = np.zeros((2, blocks.n_kernels), np.float32)
     for part in parts:
@@ -296,42 +296,28 @@ def _product(block, unit, weights, out):
 
 
 @nb.njit(nogil=True, error_model="numpy", cache=True)
-def _gradient(block, unit, residual, curvature, n_kernels):
+def _sums_of_kernels(block, unit, one, other, are_both_squares, n_kernels):
+    """(2, K) sums over the rows: of `one` times phi, or times phi^2 where both are squares, and of `other` times phi^2."""
     cuts, kernels, starts, numbers, phi = block
     out = np.zeros((2, n_kernels), np.float32)
     sums, squares = np.empty(widest(kernels), np.float32), np.empty(widest(kernels), np.float32)
+    scale = unit * unit if are_both_squares else unit
     for c in range(len(cuts) - 1):
         first, at = kernels[c], starts[c]
         n = kernels[c + 1] - first
         sums[:n] = 0
         squares[:n] = 0
         for q in range(cuts[c], cuts[c + 1]):
-            _axpy_both(phi[at : at + n], residual[q], curvature[q], sums, squares)
+            row = phi[at : at + n]
+            if are_both_squares:
+                _add_squares(row, one[q], other[q], sums, squares)
+            else:
+                _axpy_both(row, one[q], other[q], sums, squares)
             at += n
         for i in range(n):
             m = numbers[first + i]
-            out[0, m] += unit * sums[i]
+            out[0, m] += scale * sums[i]
             out[1, m] += unit * unit * squares[i]
-    return out
-
-
-@nb.njit(nogil=True, error_model="numpy", cache=True)
-def _two_diagonals(block, unit, one, other, n_kernels):
-    cuts, kernels, starts, numbers, phi = block
-    out = np.zeros((2, n_kernels), np.float32)
-    first_sums, second_sums = np.empty(widest(kernels), np.float32), np.empty(widest(kernels), np.float32)
-    for c in range(len(cuts) - 1):
-        first, at = kernels[c], starts[c]
-        n = kernels[c + 1] - first
-        first_sums[:n] = 0
-        second_sums[:n] = 0
-        for q in range(cuts[c], cuts[c + 1]):
-            _add_squares(phi[at : at + n], one[q], other[q], first_sums, second_sums)
-            at += n
-        for i in range(n):
-            m = numbers[first + i]
-            out[0, m] += unit * unit * first_sums[i]
-            out[1, m] += unit * unit * second_sums[i]
     return out
 
 
