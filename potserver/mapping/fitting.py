@@ -28,7 +28,7 @@ _GAP_M = 0.1  # between a hit and the last free sample of its beam
 _FINE, _FINER = 3.0, 2.0  # resolutions: spacing of fine kernels, and where that makes few of them
 _FEW = 500  # kernels
 _COARSE_REACH, _FINE_REACH = 0.7, 0.9  # spacings: nearer nodes than this get a kernel
-_SPARSE = 4  # every so manieth row asks for coarse kernels, which hundreds of rows share
+_SPARSE, _MANY = 4, 18_000  # of many rows every fourth asks for coarse kernels, which hundreds of rows share
 _CUT = 0.1  # activations below this are left out of the solve
 _SOLVER = Solver(n_newton=5, n_conjugate_gradient=8, longest_step=4.0, least_curvature=0.003)
 _SUPPORT_OF_NOTHING = 0.05  # of a kernel; with so much support its variance is half the prior's
@@ -103,7 +103,7 @@ def _thinned(beams: Beams, rng: np.random.Generator) -> Beams:
 def _kernels_on(rows: LabelledRows, fine_m: float, planar: bool) -> KernelSet:
     """Kernels with the prior's weights: fine ones about hits, coarse ones about all rows."""
     none, coarse_m = np.zeros((0, 3)), COARSE_SPACING * fine_m
-    about = rows.points[:: 1 if len(rows.points) < _BEAMS else _SPARSE]
+    about = rows.points[:: 1 if len(rows.points) < _MANY else _SPARSE]
     coarse = new_nodes(about, none, coarse_m, within=_COARSE_REACH, planar=planar)
     fine = new_nodes(rows.points[rows.occupied], none, fine_m, within=_FINE_REACH, planar=planar)
     return KernelSet.concatenate(
