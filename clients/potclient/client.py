@@ -188,12 +188,10 @@ class MapClient:
         seq: int | None = None,
         stamp_ns: int | None = None,
         is_return: ArrayLike | None = None,
+        params: str | None = None,
         timeout_s: float | None = None,
     ) -> Receipt:
-        """Add a cloud to the map and wait until it is in; the receipt brings the transported kernels.
-
-        It travels as a query on the lane of the clouds (DATA_LOW, BLOCK): megabytes must not delay the planners' questions on
-        the same link, and the reply takes the lane of its query.
+        """Add a cloud to the map and wait until it is in; the receipt brings the cloud's own kernels.
 
         Args:
             points: (N, 3) or (N, 2) m, sensor frame.
@@ -201,12 +199,13 @@ class MapClient:
             is_return: (N,) bool, false = no echo, the beam was free up to this point; None = all are echoes.
             seq: The robot's number of the cloud, which must grow; None takes the next one.
             stamp_ns: When the scan was taken, Unix time; None takes the clock. It places the cloud in a pose stream.
+            params: Which kernels come back: "fitted" to the cloud (the default), "transported" from atoms, or "none".
         Raises:
             MapServerError: its subclass for the reason, when the cloud is not accepted; `receipt` is set if there was one.
             NoServerError, QueryTimeoutError, LostReplyError: see there. After the last two the cloud may or may not be in.
             UsageError: an argument has the wrong shape.
         """
-        cloud = cloud_message(points, T_map_sensor, is_return, robot)
+        cloud = cloud_message(points, T_map_sensor, is_return, robot, params)
         return self._clouds.integrate(cloud, seq=seq, stamp_ns=stamp_ns, timeout_s=timeout_s)
 
     def publish(
@@ -591,7 +590,7 @@ class MapClient:
         return watch_clouds(self._link, robot, callback)
 
     def watch_params(self, callback: Callable[[TransportedParams], None], robot: str = "*") -> Subscription:
-        """Call back with transported parameters. A slow callback misses some: their numbers jump."""
+        """Call back with the parameters of clouds. A slow callback misses some: their numbers jump."""
         return params.watch_params(self._link, robot, callback)
 
     def _watch(

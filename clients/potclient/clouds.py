@@ -21,6 +21,7 @@ from potclient.link import Link, is_matching
 from potclient.questions.params import watch_params
 from potclient.results import FeedCounts, Receipt
 from potschemas import messages
+from potschemas.messages import ParamsKind
 from potschemas.wire import encode_array
 
 log = logging.getLogger("potclient")
@@ -32,6 +33,8 @@ class Clouds:
     def __init__(self, link: Link, options: FeedOptions) -> None:
         self._link, self._options = link, options
         self.on_receipt = options.on_receipt
+        wanted = options.params or ("fitted" if options.on_params else None)
+        self._params = params_kind(wanted)
         self.session = secrets.token_hex(8)
         self._lock = threading.RLock()
         self._feeds: dict[str, Feed] = {}
@@ -49,7 +52,11 @@ class Clouds:
     def integrate(
         self, cloud: messages.Cloud, *, seq: int | None, stamp_ns: int | None, timeout_s: float | None
     ) -> Receipt:
-        """See `MapClient.integrate`."""
+        """See `MapClient.integrate`.
+
+        A cloud travels as a query on the lane of the clouds (DATA_LOW, BLOCK): megabytes must not delay the planners' questions
+        on the same link, and the reply takes the lane of its query.
+        """
         robot = cloud.robot
         assert robot is not None
         number, stamp_ns = self._numbering(robot).assign(seq, stamp_ns)
@@ -76,7 +83,7 @@ class Clouds:
         if wait and timeout_s is None:
             timeout_s = 2.0 * self._options.receipt_timeout_s
         feed = self._feed(cloud.robot)
-        cloud = msgspec.structs.replace(cloud, session=self.session)
+        cloud = msgspec.structs.replace(cloud, session=self.session, params=self._params)
         return feed.offer(cloud, seq=seq, stamp_ns=stamp_ns, wait=wait, timeout_s=timeout_s)
 
     def pose(self, T_map_sensor: ArrayLike, *, stamp_ns: int | None, robot: str) -> None:
@@ -173,13 +180,33 @@ class Clouds:
             self._announced.add(robot)
 
 
+def params_kind(name: str | None) -> ParamsKind | messages.Absent:
+    """What a cloud asks for.
+
+    Raises:
+        UsageError: there is no such kind.
+    """
+    if name is None:
+        return messages.ABSENT
+    try:
+        return ParamsKind(name)
+    except ValueError:
+        raise UsageError(
+            f"params is {name!r}, need one of {', '.join(kind.value for kind in ParamsKind)}"
+        ) from None
+
+
 def cloud_message(
-    points: ArrayLike, T_map_sensor: ArrayLike | None, is_return: ArrayLike | None, robot: str
+    points: ArrayLike,
+    T_map_sensor: ArrayLike | None,
+    is_return: ArrayLike | None,
+    robot: str,
+    params: str | None = None,
 ) -> messages.Cloud:
     """A cloud without its number; arrays are copied. Values are left for the server to judge.
 
     Raises:
-        UsageError: an array has the wrong shape, or the robot's id is not legal.
+        UsageError: an array has the wrong shape, or the robot's id or the kind of parameters is not legal.
     """
     xyz = numbers(points, "cloud", np.float32)
     flags = None if is_return is None else numbers(is_return, "is_return", np.bool_)
@@ -194,4 +221,5 @@ def cloud_message(
         T_map_sensor=None if T_map_sensor is None else encode_array(pose(T_map_sensor)),
         is_return=None if flags is None else encode_array(flags),
         robot=legal_id(robot, "robot"),
+        params=params_kind(params),
     )

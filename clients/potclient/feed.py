@@ -39,8 +39,11 @@ class FeedOptions:
     receipt_timeout_s: float = 10.0  # after this long without a receipt a cloud counts as unknown
     # Called with every receipt of a published cloud, on a thread of the client's: keep it short, the next credit waits for it.
     on_receipt: Callable[[Receipt], None] | None = None
-    # Called with the transported parameters of published clouds; a slow callback misses some: their numbers jump.
+    # Called with the parameters of published clouds; a slow callback misses some: their numbers jump.
     on_params: Callable[[TransportedParams], None] | None = None
+    # Which kernels published clouds ask for: "fitted", "transported" or "none". None: fitted ones where there is `on_params`,
+    # else they are computed if somebody listens.
+    params: str | None = None
 
     def __post_init__(self) -> None:
         if self.receipt_timeout_s <= 0 or self.credit < 1:

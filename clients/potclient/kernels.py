@@ -18,11 +18,12 @@ from potclient.errors import BadReplyError, UsageError
 from potclient.files import save_npz
 from potclient.lean import lean_from_message, lean_to_message
 from potclient.occupancy import Occupancy
+from potclient.tile_changes import changed_nodes, kernels_of, steps_of
 from potschemas import answers
 from potschemas.answers import RULE_FIELDS, AnswerRule, LatentGradients, LatentSums
 from potschemas.lean import LeanTiles, lean_at
-from potschemas.messages import ABSENT, Kernels
-from potschemas.wire import encode_array
+from potschemas.messages import ABSENT, Kernels, TileChanges
+from potschemas.wire import WireError, encode_array
 
 _FILE_VERSION = 1
 _BLOCK_ELEMENTS = 2**20  # entries of one block of the (points, kernels) matrix: 8 MiB a temporary
@@ -197,6 +198,9 @@ class KernelSet:
         except ValueError as error:
             raise BadReplyError(f"kernels: {error}") from error
         lean = None if message.lean is ABSENT else lean_from_message(message.lean)[0]
+        if message.nodes is not ABSENT:
+            for name, array in _nodes_of(message.nodes, np.asarray(message.origin, np.float64)).items():
+                arrays[name] = np.concatenate([arrays[name], array])
         return cls(**arrays, rule=rule, map_revision=map_revision, lean=lean)
 
     @staticmethod
@@ -220,6 +224,19 @@ class KernelSet:
 
 
 _ARRAYS = ("hinge_mean", "hinge_var", "gamma_shape", "gamma_rate", "weight_mean", "weight_var")
+
+
+def _nodes_of(nodes: TileChanges, origin: Float64) -> dict[str, Any]:
+    """The arrays of coded kernels."""
+    try:
+        (found,) = changed_nodes(nodes, lambda _: None, 1)
+    except WireError as error:
+        raise BadReplyError(f"kernels: {error}") from error
+    sets = kernels_of(found, steps_of(nodes))
+    if not sets:
+        return {}
+    arrays = {name: np.concatenate([getattr(s, name) for s in sets]) for name in _ARRAYS}
+    return arrays | {"hinge_mean": arrays["hinge_mean"] + origin}
 
 
 def _lean_arrays(lean: LeanTiles | None) -> dict[str, Any]:

@@ -44,5 +44,5 @@ def lean_to_message(lean: LeanTiles) -> Lean:
     return Lean(
         tile_size_m=lean.tile_size_m,
         tiles=pack_array(np.column_stack([index, np.zeros(len(index), np.int64)]).T),
-        nodes=pack_array(np.stack(list(lean.nodes.values()))),
+        nodes=pack_array(np.stack(list(lean.nodes.values())), repeats=True),
     )

@@ -34,7 +34,7 @@ class ScanOutcome:
     reason: str | None = None
     message: str | None = None
     map_revision: int = 0
-    n_kernels: int = 0  # of the instantaneous map
+    n_kernels: int = 0  # of the instantaneous map; 0 where nobody listens to parameters
     n_kernels_added: int = 0
     map_kernels: int = 0
     queue_depth: int = 0

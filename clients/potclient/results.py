@@ -1,4 +1,4 @@
-"""What became of clouds: receipts, transported parameters, counts."""
+"""What became of clouds: receipts, parameters, counts."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from functools import cached_property
 from potclient.errors import MapServerError, error_from_code
 from potclient.kernels import KernelSet
 from potschemas import messages
-from potschemas.messages import ReceiptStatus, SectorReport
+from potschemas.messages import Borrowed, ReceiptStatus, SectorReport
 
 
 class Receipt:
@@ -56,8 +56,13 @@ class Receipt:
 
     @property
     def sectors(self) -> list[SectorReport]:
-        """How each sector found its atom, and how its transport ended."""
+        """How each sector found its atom, and how its transport ended; of transported parameters."""
         return self.message.sectors
+
+    @property
+    def borrowed(self) -> list[Borrowed]:
+        """What of the dictionary fitted kernels lean on."""
+        return self.message.borrowed or []
 
     @cached_property
     def kernels(self) -> KernelSet | None:
@@ -81,7 +86,7 @@ class Receipt:
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class TransportedParams:
-    """The transported parameters of one cloud, as published on `out/<robot>/params`."""
+    """The parameters of one cloud, as published on `out/<robot>/params`: fitted to it, or transported."""
 
     robot: str
     seq: int
@@ -89,6 +94,7 @@ class TransportedParams:
     map_revision: int
     kernels: KernelSet
     sectors: list[SectorReport]
+    borrowed: list[Borrowed] = dataclasses.field(default_factory=list)
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)

@@ -19,7 +19,7 @@ from matplotlib.patches import Wedge
 
 from potserver import KernelMap, MappingService, Scan
 from potserver.bundled import open_bundled
-from potserver.domain.types import Atom, KernelSet, MapUpdate, SectorMatch
+from potserver.domain.types import Atom, KernelSet, MapUpdate, ParamsKind, SectorMatch
 from potserver.numerics.coupling import couple
 from potserver.numerics.geometry import in_sector, rotation_z
 
@@ -36,7 +36,8 @@ def main() -> None:
     args = parser.parse_args()
     service, recorded = MappingService(), open_bundled("street")[0]
     update = service.integrate(
-        Scan(points=recorded.points, is_return=recorded.is_return, T_map_sensor=recorded.T_map_sensor)
+        Scan(points=recorded.points, is_return=recorded.is_return, T_map_sensor=recorded.T_map_sensor),
+        params=ParamsKind.TRANSPORTED,
     )
     ends = recorded.in_map
     matched = [sector for sector in update.sectors if sector.atom_id is not None]

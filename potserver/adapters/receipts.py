@@ -1,4 +1,4 @@
-"""What goes back for a cloud: exactly one receipt, the transported parameters, and the tick of the revision.
+"""What goes back for a cloud: exactly one receipt, the parameters where they are wanted, and the tick of the revision.
 
 Lanes: receipts and revisions DATA_HIGH, parameters DATA; all BLOCK, because Zenoh drops without telling anyone. Two
 outboxes of the map do the blocking, so that neither the mapper nor a receipt ever waits for somebody's slow bulk
@@ -16,13 +16,14 @@ from potschemas import messages
 from potschemas.keys import MapKeys
 from potserver.adapters.audit import Audit
 from potserver.adapters.intake import CloudJob, IntakeQueue
+from potserver.adapters.listeners import Listeners
 from potserver.adapters.outbox import End, Outbox
 from potserver.adapters.replies import reply, reply_error
 from potserver.codec.base import Wire, encode
 from potserver.codec.clouds import UNKNOWN_SEQ, decode_cloud_head
-from potserver.codec.kernels import encode_kernels
+from potserver.codec.kernels import encode_own_map
 from potserver.domain.map_state import MapState
-from potserver.domain.types import MapUpdate, Scan, TileChange
+from potserver.domain.types import MapUpdate, ParamsKind, Scan, TileChange
 from potserver.errors import PotserverError, TooLargeError
 from potserver.health import Health
 from potserver.limits import Limits
@@ -54,10 +55,18 @@ class ReceiptSender:
         bulk: Outbox,
     ) -> None:
         self._session, self._keys = session, keys
+        self._listeners = Listeners(session, keys, limits.max_robots)
         self._mapper, self._intake, self._health = mapper, intake, health
         self._max_bytes = limits.max_cloud_bytes
         self._prompt, self._bulk = prompt, bulk
         self._audit = Audit(keys.map_id)
+
+    def wanted(self, job: CloudJob, scan: Scan) -> ParamsKind:
+        """Which parameters of a cloud are worth computing: those that it asks for; else fitted ones, if they reach anybody."""
+        if scan.params is not None:
+            return scan.params
+        is_read = job.query is not None or self._listeners.listen_to(scan.robot_id)
+        return ParamsKind.FITTED if is_read else ParamsKind.NONE
 
     def accept(
         self, job: CloudJob, scan: Scan, update: MapUpdate, *, wait_ms: float, integrate_ms: float
@@ -84,8 +93,7 @@ class ReceiptSender:
                 ),
                 ended=self._count_receipt,
             )
-            if not self._bulk.offer(lambda: self._publish_params(scan, update)):
-                self._health.count("params.dropped")
+        self._send_params(scan, update, is_told=job.query is not None)
         self.tick(update.map_revision, update.map_kernels, update.changed)
 
     def tick(self, map_revision: int, map_kernels: int, changed: TileChange) -> None:
@@ -132,6 +140,16 @@ class ReceiptSender:
             self._prompt.post(send, n_bytes, ended=self._count_receipt)
         else:
             self._prompt.post_now(send, n_bytes, ended=self._count_receipt)
+
+    def _send_params(self, scan: Scan, update: MapUpdate, *, is_told: bool) -> None:
+        """Publish the parameters of a cloud, if there are any for anybody; `is_told`: its sender has them already."""
+        if update.own.is_nothing:
+            return
+        is_asked = scan.params is not None and not is_told
+        if not (is_asked or self._listeners.listen_to(scan.robot_id)):
+            return
+        if not self._bulk.offer(lambda: self._publish_params(scan, update)):
+            self._health.count("params.dropped")
 
     def _publish_params(self, scan: Scan, update: MapUpdate) -> None:
         wire = encode_params(self._keys.map_id, scan, update)
@@ -189,12 +207,15 @@ def encode_accepted(
             integrate_ms=integrate_ms,
             map_revision=int(update.map_revision),
             n_points=int(update.n_points),
-            n_kernels=len(update.kernels),
+            n_kernels=len(update.own.kernels),
             n_kernels_added=int(update.n_kernels_added),
             n_kernels_transported=int(update.n_kernels_transported),
             map_kernels=int(update.map_kernels),
-            sectors=[messages.SectorReport(**match._asdict()) for match in update.sectors],
-            kernels=encode_kernels(update.kernels, update.rule) if with_kernels else None,
+            sectors=_sectors(update),
+            kernels=encode_own_map(update.own, update.rule)
+            if with_kernels and not update.own.is_nothing
+            else None,
+            borrowed=_borrowed(update),
         )
     )
 
@@ -221,7 +242,7 @@ def encode_refused(
 
 
 def encode_params(map_id: str, scan: Scan, update: MapUpdate) -> Wire:
-    """The transported parameters of one cloud."""
+    """The parameters of one cloud."""
     return encode(
         messages.Params(
             map=map_id,
@@ -229,10 +250,29 @@ def encode_params(map_id: str, scan: Scan, update: MapUpdate) -> Wire:
             seq=scan.seq,
             stamp_ns=scan.stamp_ns,
             map_revision=int(update.map_revision),
-            kernels=encode_kernels(update.kernels, update.rule),
-            sectors=[messages.SectorReport(**match._asdict()) for match in update.sectors],
+            kernels=encode_own_map(update.own, update.rule),
+            sectors=_sectors(update),
+            borrowed=_borrowed(update),
         )
     )
+
+
+def _sectors(update: MapUpdate) -> list[messages.SectorReport]:
+    return [messages.SectorReport(**match._asdict()) for match in update.own.sectors]
+
+
+def _borrowed(update: MapUpdate) -> list[messages.Borrowed] | messages.Absent:
+    told = [
+        messages.Borrowed(
+            name=part.name,
+            weight=min(part.weight, 1.0),
+            displacement=part.displacement.tolist(),
+            slope=list(part.slope),
+            scale=part.scale,
+        )
+        for part in update.own.borrowed
+    ]
+    return told or messages.ABSENT
 
 
 def encode_revision(

@@ -191,8 +191,9 @@ class MapWriter:
             check_not_future(scan.stamp_ns, self._bounds.max_future_s)
             self._order.check(scan.robot_id, scan.session, scan.seq)
             started_s = time.perf_counter()
+            wanted = self._receipts.wanted(job, scan)
             with self._keeper.keeping(scan) as commit:
-                update = self._mapper.integrate(scan, commit=commit)
+                update = self._mapper.integrate(scan, params=wanted, commit=commit)
         except PotserverError as error:
             if not (isinstance(error, PoseNotYetError) and self._waits(job, error)):
                 self._receipts.refuse(job, error)
@@ -219,7 +220,7 @@ class MapWriter:
             robot_id=scan.robot_id,
             seq=scan.seq,
             n_points=update.n_points,
-            n_kernels=len(update.kernels),
+            n_kernels=len(update.own.kernels),
             n_kernels_added=update.n_kernels_added,
             map_kernels=update.map_kernels,
             map_revision=update.map_revision,

@@ -21,11 +21,13 @@ def decode_atom(message: messages.Atom, *, max_points: int) -> Atom:
     """An atom of the dictionary; the scalars beside its kernels belong to maps, and are left out.
 
     Raises:
-        ShapeError: an array has the wrong dtype, shape or byte count, or a number its sign does not allow.
+        ShapeError: an array has the wrong dtype, shape or byte count, a number its sign does not allow, or kernels are coded.
         TooLargeError: more points or kernels than a query may have.
         BadPointsError, EmptyError: NaN or infinite points, or none.
     """
     info, kernels = message.info, message.kernels
+    if kernels.nodes is not messages.ABSENT:
+        raise ShapeError("atom: its kernels are told one by one, not as nodes")
     hits, free = (
         decode_array(array, name, FLOATS, (None, 3))
         for name, array in (("hit_points", message.hit_points), ("free_points", message.free_points))

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from potschemas import messages, wire
 from potschemas.messages import DType
 from potserver.codec.base import FLOATS, MAX_SMALL_BYTES, decode, decode_array
-from potserver.domain.types import Float64, Scan, check_rigid
+from potserver.domain.types import Float64, ParamsKind, Scan, check_rigid
 from potserver.errors import (
     BadMessageError,
     BadPointsError,
@@ -100,11 +100,12 @@ def decode_cloud(payload: bytes, *, robot_id: str | None, limits: Limits, pose_a
         is_return=is_return,
         T_map_sensor=pose,
         is_planar=points.shape[1] == 2,
+        params=None if cloud.params is messages.ABSENT else ParamsKind(cloud.params.value),
     )
 
 
 def encode_cloud(scan: Scan) -> bytes:
-    """The scan as `pot.cloud.v1`, complete: `read_cloud` needs nothing else to make the same scan again."""
+    """The scan as `pot.cloud.v1`, complete: `read_cloud` needs nothing else to map the same scan again."""
     return wire.encode(
         messages.Cloud(
             seq=scan.seq,

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -13,17 +14,38 @@ from potschemas.answers import AnswerRule
 from potschemas.lean import LeanTiles
 from potschemas.wire import pack_array
 from potserver.asking.lattices import LEAST_ON_LATTICE, distinct_rows, lattice_of, shapes_of
+from potserver.asking.tile_codes import Steps, code_tile
+from potserver.asking.tiles import Change
 from potserver.codec.base import float32_fields
-from potserver.domain.types import KernelSet
+from potserver.codec.tile_changes import code_changes
+from potserver.domain.types import Float64, KernelSet, OwnMap
 
 _BYTES_OF_SHAPE = 5 * 4  # hinge_var, gamma_shape, gamma_rate
 _BYTES_OF_LATTICE = 4 * 8
+_OWN_STEP = 0.25  # log-odds, of a scan's own map: off by an eighth at most
 
 
 def encode_kernels(kernels: KernelSet, rule: AnswerRule, lean: LeanTiles | None = None) -> messages.Kernels:
     """Kernels as they are: float64 hinges become float32 offsets from their centroid, in whole metres."""
     origin = np.round(kernels.hinge_mean.mean(axis=0)) if len(kernels) else np.zeros(3)
-    fields: dict[str, Any] = {**float32_fields(kernels.moved(-origin)), **rule.fields()}
+    return _kernels(kernels.moved(-origin), origin, rule, lean)
+
+
+def encode_own_map(own: OwnMap, rule: AnswerRule) -> messages.Kernels:
+    """What one scan says: fitted kernels as nodes in whole steps, carried ones as they are."""
+    if not own.spacings_m:
+        return _kernels(own.kernels, own.origin, rule, own.lean)
+    steps = Steps.of(_OWN_STEP, rule.prior_var)
+    codes = code_tile(own.kernels, own.spacings_m, own.size_m, steps)
+    told = _kernels(codes.others, own.origin, rule, own.lean)
+    return msgspec.structs.replace(told, nodes=code_changes([Change(codes, None)], steps))
+
+
+def _kernels(
+    kernels: KernelSet, origin: Float64, rule: AnswerRule, lean: LeanTiles | None
+) -> messages.Kernels:
+    """Kernels relative to an origin, (3,) m, map frame."""
+    fields: dict[str, Any] = {**float32_fields(kernels), **rule.fields()}
     told = messages.ABSENT if lean is None else encode_lean(lean)
     return messages.Kernels(origin=origin.tolist(), **fields, lean=told)
 
@@ -35,7 +57,7 @@ def encode_lean(lean: LeanTiles, revisions: Sequence[int] | None = None) -> mess
     return messages.Lean(
         tile_size_m=lean.tile_size_m,
         tiles=pack_array(np.column_stack([index, revision]).T),
-        nodes=pack_array(np.stack(list(lean.nodes.values()))),
+        nodes=pack_array(np.stack(list(lean.nodes.values())), repeats=True),
     )
 
 

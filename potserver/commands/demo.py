@@ -154,6 +154,7 @@ def _introduce(options: argparse.Namespace, recordings: dict[str, Recording], co
             "The built-in atoms were learned in made-up towns, and some on other beams of the rooms."
         )
     console.print(
+        "Here receipts bring kernels carried from atoms; unasked they bring kernels fitted to the scan, which cost less.\n"
         "carried: kernels that the map took from transported atoms; placed: kernels added where those explain nothing;\n"
         "W2: root of the transport cost under the entropic plan, hits plus free points (never 0, the blur counts)."
     )
@@ -189,7 +190,11 @@ def _feed(client: MapClient, recording: Recording, console: Console) -> list[_Fe
             status.update(f"scan {number + 1} of {len(recording)}")
             scan, labels = hold_out.split(recorded)
             receipt = client.integrate(
-                scan.to_send, scan.T_map_sensor, robot="demo", is_return=scan.is_return
+                scan.to_send,
+                scan.T_map_sensor,
+                robot="demo",
+                is_return=scan.is_return,
+                params="transported",  # to show which atoms fit: by default fitted kernels come back, for half the work
             )
             fed.append(_Fed(scan, labels, receipt))
     return fed

@@ -11,12 +11,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potschemas.answers import AnswerRule
+from potschemas.lean import LeanTiles
 from potserver.errors import BadPointsError, BadPoseError, EmptyError, ShapeError
 from potserver.numerics.beams import Beams
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 Bool = NDArray[np.bool_]
+
+
+class ParamsKind(str, Enum):
+    """Which kernels a scan's sender gets back."""
+
+    FITTED = "fitted"  # solved on the scan's labels, beyond what the dictionary expects there
+    TRANSPORTED = (
+        "transported"  # of the nearest atoms, carried by optimal transport and refined by the labels
+    )
+    NONE = "none"  # none are computed
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -37,6 +48,7 @@ class Scan:
     session: str = ""  # the run of the robot's program that counts `seq`
     seq: int = 0
     stamp_ns: int = 0
+    params: ParamsKind | None = None  # what the sender wants back; none: it did not say
 
     def __post_init__(self) -> None:
         n = len(self.points)
@@ -298,25 +310,65 @@ class TileChange(NamedTuple):
     tiles: list[tuple[int, int, int]]  # floor(p_map / tile_size_m)
 
 
+class Borrowed(NamedTuple):
+    """A part of the dictionary that fitted kernels lean on, and where it was put."""
+
+    name: str
+    weight: float  # share of what is expected
+    displacement: Float64  # (3,) m, map frame: of its origin
+    slope: tuple[float, float]  # of the ground along x and y
+    scale: float  # of its log-odds, in (0, 1]
+
+
+@dataclasses.dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class OwnMap:
+    """What one scan says by itself, its instantaneous map: this goes back to the sender."""
+
+    kernels: KernelSet  # hinges relative to `origin`, along the map's axes
+    origin: Float64  # (3,) m, map frame
+    spacings_m: tuple[float, ...] = ()  # of the lattices that all kernels stand on; none: they were carried
+    size_m: float = 0.0  # edge of the cube at `origin` that holds those lattices
+    lean: LeanTiles | None = None  # what the kernels' sums are added to
+    borrowed: tuple[Borrowed, ...] = ()  # what that comes from
+    sectors: tuple[SectorMatch, ...] = ()  # how each was served; of carried kernels
+    converged: bool = True
+
+    is_nothing: bool = False  # nobody wanted any
+
+    @staticmethod
+    def nothing() -> OwnMap:
+        """That of a scan whose sender wants none."""
+        return OwnMap(kernels=KernelSet.empty(), origin=np.zeros(3), is_nothing=True)
+
+
 @dataclasses.dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class MapUpdate:
     """What one integrated scan did."""
 
     map_revision: int
-    kernels: KernelSet  # the instantaneous map, map frame
-    sectors: list[SectorMatch]
+    own: OwnMap
     n_points: int  # beams used
     n_kernels_added: int  # that the overall map took, of both kinds
     # of those, carried from atoms; the others were placed where nothing explained the data
     n_kernels_transported: int
     map_kernels: int
     converged: bool  # neither joint solve got stuck; if one did, its weights are the best found
-    rule: AnswerRule  # what turns `kernels` into answers
+    rule: AnswerRule  # what turns the kernels of `own` into answers
     changed: TileChange
     timings_ms: dict[str, float]  # per stage of the pipeline
     not_leaning: str | None = (
         None  # why the map leans on nothing about this scan; none: it does, or never would
     )
+
+    @property
+    def kernels(self) -> KernelSet:
+        """The scan's own map, map frame."""
+        return self.own.kernels.moved(self.own.origin)
+
+    @property
+    def sectors(self) -> tuple[SectorMatch, ...]:
+        """Which atoms served them; of transported parameters."""
+        return self.own.sectors
 
 
 def yaw_pose(x_m: float, y_m: float, yaw_rad: float, z_m: float = 0.0) -> Float64:

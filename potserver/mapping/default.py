@@ -1,17 +1,19 @@
 """How profile `default` maps a scan.
 
-Two things come of it, and neither needs the other. Atoms are carried to the scan: their kernels, refined by its labels, are its
-instantaneous map, which goes back to the sender. And its labels become evidence of the overall map, whose kernels stand on
-lattices; it takes none from atoms.
+Two things come of it, and neither needs the other. Its labels become evidence of the overall map, whose kernels stand on
+lattices; it takes none from atoms. And its instantaneous map goes back to the sender, where one is wanted: by default kernels
+that are fitted to it and lean on what the dictionary expects; else atoms are carried to it, and refined by its labels.
 """
 
 from __future__ import annotations
 
 from potserver.domain.map_state import MapState
 from potserver.domain.tiles import TiledMap
-from potserver.domain.types import KernelSet, Scan
+from potserver.domain.types import KernelSet, OwnMap, ParamsKind, Scan
 from potserver.mapping.carrying import Carrier
+from potserver.mapping.fitting import fitted_map
 from potserver.mapping.fusion import Fused, Look, Moment, fuse, refit, stalest_part
+from potserver.mapping.leaning import Expected
 from potserver.mapping.pipeline import Integrated, LabelledScan, Pipeline, ScanMap, integrated
 from potserver.mapping.refinement import borrowed_prior, instantaneous_map
 from potserver.mapping.sampling import Draws
@@ -20,11 +22,11 @@ from potserver.numerics.threads import parallel_pair
 
 
 class DefaultPipeline(Pipeline):
-    """Evidence, lattice kernels and joint solves for the map; refined atoms for the sender."""
+    """Evidence, lattice kernels and joint solves for the map; a fit of its own, or refined atoms, for the sender."""
 
     keeps_evidence = True
 
-    def integrate(self, state: MapState, scan: Scan, carrier: Carrier) -> Integrated:
+    def integrate(self, state: MapState, scan: Scan, carrier: Carrier, params: ParamsKind) -> Integrated:
         clock, draws = Stopwatch(), Draws.of(self.seed, state.n_scans)
         moment = self.moment(state, scan)
         with clock("label"):
@@ -41,7 +43,11 @@ class DefaultPipeline(Pipeline):
             draws.surface,
             expected.place,
         )
-        own, fused = self.learn(tiled, look, seen, moment, carrier, clock)
+        own, fused = parallel_pair(
+            lambda: self.own_map(params, seen, expected.place, carrier, tiled.grid.fine_m, clock),
+            lambda: self.fuse(tiled, look, moment, clock),
+            self.threads,
+        )
         with clock("index"):
             tiled, fused = self.age(tiled.with_tiles(fused.tiles, threads=self.threads), fused, moment)
             snapshot = self.snapshot(tiled, moment.revision, state.scores)
@@ -57,24 +63,36 @@ class DefaultPipeline(Pipeline):
 
     # --- the steps, in order ---------------------------------------------------------------------------------------------
 
-    def learn(
+    def own_map(
         self,
-        tiled: TiledMap,
-        look: Look,
+        params: ParamsKind,
         seen: LabelledScan,
-        moment: Moment,
+        expected: Expected | None,
         carrier: Carrier,
+        resolution_m: float,
         clock: Stopwatch,
-    ) -> tuple[ScanMap, Fused]:
-        """The scan's own map and the overall map's new tiles, worked out at the same time."""
-        return parallel_pair(
-            lambda: self.own_map(seen, carrier, tiled.grid.fine_m, clock),
-            lambda: self.fuse(tiled, look, moment, clock),
-            self.threads,
-        )
+    ) -> OwnMap:
+        """The scan's instantaneous map, as its sender wants it."""
+        if params is ParamsKind.NONE:
+            return OwnMap.nothing()
+        if params is ParamsKind.TRANSPORTED:
+            return self.transported(seen, carrier, resolution_m, clock).told
+        scan = seen.scan
+        with clock("fit"):
+            return fitted_map(
+                seen.beams.learned,
+                scan.origin,
+                expected,
+                resolution_m,
+                seen.draws.own,
+                planar=scan.is_planar,
+                threads=self.own_threads,
+            )
 
-    def own_map(self, seen: LabelledScan, carrier: Carrier, resolution_m: float, clock: Stopwatch) -> ScanMap:
-        """The scan's instantaneous map: atoms carried to it, refined by its labels."""
+    def transported(
+        self, seen: LabelledScan, carrier: Carrier, resolution_m: float, clock: Stopwatch
+    ) -> ScanMap:
+        """Atoms carried to the scan, refined by its labels."""
         carried = self.carry(seen, carrier, clock)
         prior = KernelSet.concatenate([self.prior_of(t.kernels, m.w2_m2) for m, t in carried.served()])
         with clock("refine"):

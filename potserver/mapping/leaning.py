@@ -13,7 +13,7 @@ import numpy as np
 
 from potschemas.lean import Bytes, to_bytes
 from potserver.domain.tiles import TileGrid, TileIndex
-from potserver.domain.types import Bool, Float64
+from potserver.domain.types import Bool, Borrowed, Float64
 from potserver.numerics.beams import Beams, LabelledPoints, beam_weights
 from potserver.numerics.heights import Ground, HeightLabels, HeightModel, HeightModels, ground_of
 
@@ -23,6 +23,7 @@ _STEEPEST = 0.3  # slope of a ground
 _LEAST_GROUND = 6  # cells of a scan's surroundings that lie on one plane
 _SURE_OF_MODEL = 5.0  # precision of the scale about 1
 _LEAST_SCALE = 0.25  # with less of it, the model does not fit here
+_LEAST_SHARE = 0.01  # of a model that is worth naming
 _REACH_M = (-2.0, 6.0)  # heights between which a tile has something to lean on
 
 NO_MODEL, PLANAR, NO_GROUND, NOVEL = (
@@ -40,11 +41,23 @@ class Expected(NamedTuple):
     ground: Ground  # about `origin`
     origin: Float64  # (3,) m, map frame: the sensor
     scale: float  # of the log-odds, in (0, 1]: how well the scan's own labels bear them out
+    shares: tuple[float, ...] = ()  # of the dictionary's models in this one
 
     def at(self, points: Float64) -> Float64:
         """(N,) log-odds at (N, 3) points, m, map frame."""
         about = points - self.origin
         return self.scale * self.model.at(self.ground.below(about), np.hypot(about[:, 0], about[:, 1]))
+
+    @property
+    def borrowed(self) -> tuple[Borrowed, ...]:
+        """What of the dictionary it is made of, and where that was put."""
+        below = self.origin + np.array([0.0, 0.0, self.ground.height_m])
+        slope = (self.ground.slope_x, self.ground.slope_y)
+        return tuple(
+            Borrowed(f"heights-{number}", share, below, slope, self.scale)
+            for number, share in enumerate(self.shares)
+            if share >= _LEAST_SHARE
+        )
 
 
 class Expectation(NamedTuple):
@@ -88,11 +101,13 @@ def expect(
         labelled.occupied[judged],
         beam_weights(labelled)[judged],
     )
-    model = models.likeliest(labels)
+    shares = models.shares(labels)
+    model = models.mixed(shares)
     scale = _scale(model.at(labels.height_m, labels.range_m), labels.occupied, labels.weight)
     if scale < _LEAST_SCALE:
         return Expectation(None, NOVEL)
-    return Expectation(Expected(model, ground, origin, min(scale, 1.0)), None)
+    place = Expected(model, ground, origin, min(scale, 1.0), tuple(shares.tolist()))
+    return Expectation(place, None)
 
 
 def _scale(log_odds: Float64, occupied: Bool, weight: Float64) -> float:

@@ -15,7 +15,7 @@ from __future__ import annotations
 from potschemas.answers import AnswerRule
 from potserver.domain.map_state import MapState
 from potserver.domain.tiles import TiledMap
-from potserver.domain.types import KernelSet, Scan
+from potserver.domain.types import KernelSet, OwnMap, ParamsKind, Scan
 from potserver.mapping.carrying import Carrier
 from potserver.mapping.dispersions import integrated_out
 from potserver.mapping.fusion import Fused, Moment, append
@@ -62,7 +62,7 @@ class PotPipeline(Pipeline):
 
     keeps_evidence = False
 
-    def integrate(self, state: MapState, scan: Scan, carrier: Carrier) -> Integrated:
+    def integrate(self, state: MapState, scan: Scan, carrier: Carrier, params: ParamsKind) -> Integrated:
         clock, draws = Stopwatch(), Draws.of(self.seed, state.n_scans)
         moment = self.moment(state, scan)
         with clock("label"):
@@ -77,7 +77,8 @@ class PotPipeline(Pipeline):
         with clock("check"):
             scores = self.check(snapshot, seen, state.scores, draws)
         after = MapState(snapshot=snapshot, tiled=tiled, stamp_ns=moment.stamp_ns, scores=scores)
-        return integrated(state, after, seen, own, fused, clock.timings_ms)
+        told = OwnMap.nothing() if params is ParamsKind.NONE else own.told
+        return integrated(state, after, seen, told, fused, clock.timings_ms)
 
     def own_map(self, seen: LabelledScan, carrier: Carrier, resolution_m: float, clock: Stopwatch) -> ScanMap:
         """The scan's instantaneous map: what was carried, its dispersions integrated out."""

@@ -9,13 +9,24 @@ import dataclasses
 from abc import ABC, abstractmethod
 from typing import NamedTuple
 
+import numpy as np
+
 from potschemas.answers import OBSERVED_ACTIVATION, AnswerRule
 from potserver.domain.dictionary import AtomDictionary
 from potserver.domain.kernel_map import KernelMap
 from potserver.domain.map_state import MapState
 from potserver.domain.running_scores import RunningScores
 from potserver.domain.tiles import TiledMap
-from potserver.domain.types import KernelSet, MapUpdate, Scan, Sector, SectorMatch, TileChange
+from potserver.domain.types import (
+    KernelSet,
+    MapUpdate,
+    OwnMap,
+    ParamsKind,
+    Scan,
+    Sector,
+    SectorMatch,
+    TileChange,
+)
 from potserver.mapping.carrying import Carried, Carrier
 from potserver.mapping.checking import check
 from potserver.mapping.fusion import SCAN_EFFORT, FitEffort, Fused, FusionOptions, Moment, grid_for
@@ -53,8 +64,9 @@ class LabelledScan(NamedTuple):
 
     scan: Scan
     beams: DrawnBeams  # relative to the sensor, map axes
-    labelled: LabelledPoints  # map frame
-    sectors: list[Sector]
+    about_sensor: LabelledPoints  # relative to the sensor, map axes
+    labelled: LabelledPoints  # the same, map frame
+    draws: Draws
 
 
 class ScanMap(NamedTuple):
@@ -64,6 +76,17 @@ class ScanMap(NamedTuple):
     prior: KernelSet  # as carried, map frame
     kernels: KernelSet  # refined, where the pipeline refines
     converged: bool
+
+    @property
+    def told(self) -> OwnMap:
+        """What the sender gets."""
+        origin = np.round(self.kernels.hinge_mean.mean(axis=0)) if len(self.kernels) else np.zeros(3)
+        return OwnMap(
+            kernels=self.kernels.moved(-origin),
+            origin=origin,
+            sectors=tuple(self.reports),
+            converged=self.converged,
+        )
 
 
 class Integrated(NamedTuple):
@@ -94,9 +117,14 @@ class Pipeline(ABC):
         self.fusion = FusionOptions.of(settings, self.method.effort, self.method.faces)
 
     @abstractmethod
-    def integrate(self, state: MapState, scan: Scan, carrier: Carrier) -> Integrated:
+    def integrate(self, state: MapState, scan: Scan, carrier: Carrier, params: ParamsKind) -> Integrated:
         """Map a scan. The state is not changed.
 
+        Args:
+            state: Of the map.
+            scan: With its pose in the map.
+            carrier: The dictionary's atoms.
+            params: What the sender gets back; the map does not depend on it.
         Raises:
             EmptyError: no beam lies within the range limits.
             SolverError: a solve ended without numbers.
@@ -125,7 +153,7 @@ class Pipeline(ABC):
     # --- the steps of a scan ---------------------------------------------------------------------------------------------
 
     def label(self, scan: Scan, draws: Draws) -> LabelledScan:
-        """Draw beams, put labelled points on them, and cut those into sectors."""
+        """Draw beams, and put labelled points on them."""
         beams = draw_beams(scan, BeamLimits.of(self.settings), draws)
         labelled = label_beams(
             beams.learned,
@@ -133,10 +161,14 @@ class Pipeline(ABC):
             gap_m=self.settings.free_gap_m,
             rng=draws.learn,
         )
-        drawn = thin_beams(labelled, len(beams.learned.ends), self.method.match_beams, draws)
-        sectors = cut_sectors(drawn, scan.T_map_sensor, self.settings.max_range_m, self.method.sectors)
         in_map = labelled._replace(points=labelled.points + scan.origin)
-        return LabelledScan(scan, beams, in_map, sectors)
+        return LabelledScan(scan, beams, labelled, in_map, draws)
+
+    def sectors(self, seen: LabelledScan) -> list[Sector]:
+        """Cut some of a scan's labelled points into sectors."""
+        method, n_beams = self.method, len(seen.beams.learned.ends)
+        drawn = thin_beams(seen.about_sensor, n_beams, method.match_beams, seen.draws)
+        return cut_sectors(drawn, seen.scan.T_map_sensor, self.settings.max_range_m, method.sectors)
 
     def moment(self, state: MapState, scan: Scan) -> Moment:
         """The change that a scan is."""
@@ -164,9 +196,10 @@ class Pipeline(ABC):
     def carry(self, seen: LabelledScan, carrier: Carrier, clock: Stopwatch) -> Carried:
         """Carry an atom to each sector."""
         with clock("match"):
-            matches = carrier.match(seen.sectors, planar=seen.scan.is_planar)
+            sectors = self.sectors(seen)
+            matches = carrier.match(sectors, planar=seen.scan.is_planar)
         with clock("transport"):
-            return Carried(seen.sectors, matches, carrier.transport(matches, seen.sectors))
+            return Carried(sectors, matches, carrier.transport(matches, sectors))
 
     def check(
         self, snapshot: KernelMap, seen: LabelledScan, scores: RunningScores, draws: Draws
@@ -179,7 +212,7 @@ def integrated(
     before: MapState,
     after: MapState,
     seen: LabelledScan,
-    own: ScanMap,
+    own: OwnMap,
     fused: Fused,
     timings_ms: dict[str, float],
     not_leaning: str | None = None,
@@ -190,7 +223,7 @@ def integrated(
         before: The state that the scan was added to.
         after: The state with its snapshot, map and scores.
         seen: The scan.
-        own: Its instantaneous map.
+        own: What goes back to its sender.
         fused: What changed in the overall map.
         timings_ms: By step.
         not_leaning: Why the map does not lean about this scan; None: it does, or the pipeline never does.
@@ -198,17 +231,20 @@ def integrated(
     assert after.tiled is not None, "a scan makes a map"
     update = MapUpdate(
         map_revision=after.map_revision,
-        kernels=own.kernels,
-        sectors=own.reports,
+        own=own,
         n_points=len(seen.beams.learned.ends) + len(seen.beams.checked.ends),
         n_kernels_added=fused.n_added,
         n_kernels_transported=fused.n_transported,
         map_kernels=len(after.snapshot),
         converged=own.converged and fused.converged,
-        # atoms bring few and wide kernels: where one of them is known, so is the place
-        rule=dataclasses.replace(after.snapshot.rule, observed_activation=OBSERVED_ACTIVATION),
+        rule=rule_of(own, after.snapshot.rule),
         changed=TileChange(after.tiled.grid.size_m, sorted(fused.tiles)),
         timings_ms=timings_ms,
         not_leaning=not_leaning,
     )
     return Integrated(dataclasses.replace(after, epoch=before.epoch, n_scans=before.n_scans + 1), update)
+
+
+def rule_of(own: OwnMap, rule: AnswerRule) -> AnswerRule:
+    """What turns a scan's own map into answers. Carried kernels are few and wide: where one is known, so is the place."""
+    return rule if own.spacings_m else dataclasses.replace(rule, observed_activation=OBSERVED_ACTIVATION)

@@ -33,6 +33,14 @@ class Effort(NamedTuple):
 INSTANT_EFFORT = Effort(newton_steps=4, gradient_steps=8)
 
 
+class LabelledRows(NamedTuple):
+    """Labelled points, those of one voxel and label as one: their mean."""
+
+    points: Float64  # (N, 3) m
+    occupied: Bool  # (N,)
+    counts: Float32  # (N,) how much each counts
+
+
 class Refined(NamedTuple):
     """Kernels with refined weights, and whether the solve went well; if not, they are the best found."""
 
@@ -57,6 +65,19 @@ def flat_prior(carried: KernelSet, prior_var: float) -> KernelSet:
     return carried.replace(weight_mean=zeros, weight_var=zeros + np.float32(prior_var))
 
 
+def rows_of(labelled: LabelledPoints, voxel_m: float) -> LabelledRows:
+    """The points of each voxel as one datum; hits have voxels of half the edge.
+
+    Args:
+        labelled: Small coordinates.
+        voxel_m: Edge of a voxel.
+    """
+    rows, _ = evidence.add(
+        evidence.Rows.empty(), labelled.points, labelled.occupied, beam_weights(labelled), voxel_m
+    )
+    return LabelledRows(evidence.positions(rows, voxel_m), rows.occupied, rows.sums[:, 3])
+
+
 def instantaneous_map(
     prior: KernelSet, labelled: LabelledPoints, resolution_m: float, *, threads: int
 ) -> Refined:
@@ -72,11 +93,10 @@ def instantaneous_map(
     """
     voxel_m = _VOXEL * resolution_m
     corner = bounds(labelled.points)[0]
-    rows, _ = evidence.add(
-        evidence.Rows.empty(), labelled.points - corner, labelled.occupied, beam_weights(labelled), voxel_m
+    rows = rows_of(labelled._replace(points=labelled.points - corner), voxel_m)
+    return refine(
+        prior, rows.points + corner, rows.occupied, rows.counts, edge_m=_CUBE * voxel_m, threads=threads
     )
-    points = evidence.positions(rows, voxel_m) + corner
-    return refine(prior, points, rows.occupied, rows.sums[:, 3], edge_m=_CUBE * voxel_m, threads=threads)
 
 
 def refine(

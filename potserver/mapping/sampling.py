@@ -36,13 +36,15 @@ class Draws(NamedTuple):
     learn: np.random.Generator
     check: np.random.Generator
     surface: np.random.Generator
+    own: (
+        np.random.Generator
+    )  # of the scan's own map: whatever its sender asks for, the overall map is the same
 
     @staticmethod
     def of(seed: int, n_scans: int) -> Draws:
         """Those of the scan that comes after `n_scans` others."""
-        return Draws(
-            *(np.random.default_rng(key) for key in ((seed, n_scans), (seed, n_scans, 1), (seed, n_scans, 2)))
-        )
+        keys: list[tuple[int, ...]] = [(seed, n_scans), *((seed, n_scans, use) for use in (1, 2, 3))]
+        return Draws(*(np.random.default_rng(key) for key in keys))
 
 
 class DrawnBeams(NamedTuple):

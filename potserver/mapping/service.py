@@ -15,7 +15,7 @@ from potserver.domain.map_state import MapState
 from potserver.domain.pages import Pages
 from potserver.domain.running_scores import RunningScores
 from potserver.domain.tiles import TiledMap, TileGrid, TileIndex
-from potserver.domain.types import Float64, MapUpdate, Scan, TileChange, yaw_pose
+from potserver.domain.types import Float64, MapUpdate, ParamsKind, Scan, TileChange, yaw_pose
 from potserver.errors import SettingsError, UnknownRobotError
 from potserver.mapping import edits
 from potserver.mapping.default import DefaultPipeline
@@ -115,16 +115,21 @@ class MappingService:
         """Match against other atoms from the next scan on; the map keeps what it has."""
         self._carrier = self._pipeline.carrier(dictionary)  # one assignment: no scan sees a half of it
 
-    def integrate(self, scan: Scan, *, commit: Callable[[], None] | None = None) -> MapUpdate:
-        """Carry atoms to a scan and add it to the map.
+    def integrate(
+        self, scan: Scan, *, params: ParamsKind | None = None, commit: Callable[[], None] | None = None
+    ) -> MapUpdate:
+        """Add a scan to the map, and work out what goes back to its sender.
 
         Args:
             scan: With its pose in the map.
+            params: What that is; by default what the scan asks for, and `FITTED` where it does not say. In profile `paper` both
+                kinds are what was carried.
             commit: Called when all is computed and nothing has changed yet; if it raises, nothing will.
         Raises:
             EmptyError: no beam lies within the range limits. The map is unchanged, as after any error.
         """
-        state, update = self._pipeline.integrate(self.state, scan, self._carrier)
+        wanted = params or scan.params or ParamsKind.FITTED
+        state, update = self._pipeline.integrate(self.state, scan, self._carrier, wanted)
         if commit is not None:
             commit()
         # nothing above changed the service, and nothing below can fail
@@ -225,9 +230,9 @@ class MappingService:
             angle = rng.uniform(-np.pi, np.pi, 4000)
             height = np.zeros(4000) if planar else rng.uniform(-1.5, 3.0, 4000)
             points = np.stack([8.0 * np.cos(angle), 6.0 * np.sin(angle), height], axis=1).astype(np.float32)
-            for k in range(2):
+            for k, params in enumerate((ParamsKind.FITTED, ParamsKind.TRANSPORTED)):
                 pose = yaw_pose(0.3 * k, 0.0, 0.0)
-                scratch.integrate(Scan(points=points, T_map_sensor=pose, is_planar=planar))
+                scratch.integrate(Scan(points=points, T_map_sensor=pose, is_planar=planar), params=params)
             scratch.snapshot.occupancy(points)
 
     def _edited(

@@ -56,12 +56,16 @@ class HeightModels(NamedTuple):
     ranges_m: Float64  # (B,) ascending
     log_odds: Float64  # (M, A, B)
 
-    def likeliest(self, labels: HeightLabels) -> HeightModel:
-        """The mean of the models' log-odds, each weighed by how likely it makes labels."""
+    def shares(self, labels: HeightLabels) -> Float64:
+        """(M,) how likely each makes labels, with a sum of 1."""
         models = [HeightModel(self.heights_m, self.ranges_m, table) for table in self.log_odds]
         nats = np.array([labels.log_likelihood(model) for model in models]) * _WORTH
         share = np.exp(nats - nats.max())
-        return models[0]._replace(log_odds=np.tensordot(share / share.sum(), self.log_odds, 1))
+        return np.asarray(share / share.sum())
+
+    def mixed(self, shares: Float64) -> HeightModel:
+        """The mean of the models' log-odds, by (M,) shares."""
+        return HeightModel(self.heights_m, self.ranges_m, np.tensordot(shares, self.log_odds, 1))
 
 
 class HeightLabels(NamedTuple):

@@ -25,7 +25,7 @@ from potserver.codec.clouds import encode_cloud, read_cloud
 from potserver.domain.map_state import MapState
 from potserver.domain.order import CloudOrder, Heard
 from potserver.domain.pages import Pages
-from potserver.domain.types import Scan
+from potserver.domain.types import ParamsKind, Scan
 from potserver.errors import (
     MapFileError,
     PotserverError,
@@ -206,7 +206,7 @@ class MapStore:
         for number, payload in self._journal.scans(self._taken):
             try:
                 scan = read_cloud(payload)
-                mapper.integrate(scan)
+                mapper.integrate(scan, params=ParamsKind.NONE)
             except PotserverError as error:
                 raise MapFileError(
                     f"{self.folder}: scan {number} of the journal, which was accepted, cannot be integrated again: {error}."

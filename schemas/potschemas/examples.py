@@ -40,6 +40,7 @@ def examples() -> dict[str, m.Message]:
     add(m.Cloud(seq=8, stamp_ns=_STAMP_NS, points=_f4([[4.0, 0.5], [3.5, -1.0]])), "planar")
     add(m.Cloud(seq=9, stamp_ns=_STAMP_NS, points=points, is_return=_bool([False] * 3)), "no_return")
     add(m.Cloud(seq=2**63 - 1, stamp_ns=2**63 - 1, points=_f4(np.zeros((0, 3)))), "no_points")
+    add(m.Cloud(seq=10, stamp_ns=0, points=points, params=m.ParamsKind.TRANSPORTED), "params")
     add(m.Pose(stamp_ns=_STAMP_NS, T_map_sensor=_pose(12.0, -3.5, 1.75)))
 
     kernels, no_kernels = _kernels(2), _kernels(0)
@@ -47,6 +48,7 @@ def examples() -> dict[str, m.Message]:
     add(no_kernels, "empty")
     add(_kernels(1, origin=[500_000.0, 5_400_000.0, 250.5]), "far_origin")
     add(msgspec.structs.replace(no_kernels, lean=_lean()), "lean")
+    add(msgspec.structs.replace(no_kernels, lean=_lean(), nodes=_nodes()), "nodes")
 
     served = m.SectorReport(
         azimuth_min_rad=-0.5,
@@ -146,6 +148,25 @@ def examples() -> dict[str, m.Message]:
     add(
         m.Params(map="default", robot="r1", seq=8, stamp_ns=_STAMP_NS, map_revision=31, kernels=no_kernels),
         "empty",
+    )
+    fitted = msgspec.structs.replace(no_kernels, lean=_lean(), nodes=_nodes())
+    borrowed = [
+        m.Borrowed(
+            name="heights-2", weight=0.75, displacement=[12.0, -3.5, 0.0], slope=[0.0, 0.015625], scale=1.0
+        )
+    ]
+    add(msgspec.structs.replace(params, kernels=fitted, sectors=[], borrowed=borrowed), "fitted")
+    add(
+        m.Receipt(
+            map="default",
+            robot="r1",
+            seq=7,
+            status=m.ReceiptStatus.ACCEPTED,
+            n_kernels=2,
+            kernels=fitted,
+            borrowed=borrowed,
+        ),
+        "fitted",
     )
     add(
         m.Revision(
@@ -535,6 +556,26 @@ def _lean() -> m.Lean:
         tile_size_m=8.0,
         tiles=_packed(np.array([[0], [-1], [0], [31]], np.int64)),
         nodes=_packed(nodes),
+    )
+
+
+def _nodes() -> m.TileChanges:
+    """Two kernels of 0.5 m on a lattice."""
+    none = _packed(np.zeros(0, np.int64))
+    lattice = m.LatticeNodes(
+        shape=_packed(np.array([0.0625, 0.0625, 0.0625, 8.0, 4.0], np.float32)),
+        spacing=0.5,
+        offset=[0.25, 0.25, 0.25],
+        cells=[16, 16, 16],
+        tiles=_packed(np.zeros(1, np.int64)),
+        toggled=_packed(np.array([18, 1], np.int64)),  # nodes 17 and 18
+        mean_changes=none,
+        var_changes=none,
+        new_means=_packed(np.array([24, 15], np.int64)),  # 12, -8
+        new_vars=_packed(np.array([5, 0], np.int64)),  # -3, 0
+    )
+    return m.TileChanges(
+        step=0.25, var_step=0.75, var_unit=64.0, based=_packed(np.array([False])), lattices=[lattice]
     )
 
 

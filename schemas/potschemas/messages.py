@@ -35,6 +35,7 @@ Measured = Annotated[float, msgspec.Meta(extra_json_schema={"nan_is_null": True}
 Identifier = Annotated[str, msgspec.Meta(pattern=r"^[a-z0-9][a-z0-9_.-]{0,62}$(?!\n)")]
 Dims = Annotated[int, msgspec.Meta(ge=2, le=3)]
 Vector3 = Annotated[list[Finite], msgspec.Meta(min_length=3, max_length=3)]
+Slope = Annotated[list[Finite], msgspec.Meta(min_length=2, max_length=2)]
 GridShape = Annotated[list[Count], msgspec.Meta(min_length=3, max_length=3)]
 _Int64 = Annotated[int, msgspec.Meta(ge=-_INT64_MAX - 1, le=_INT64_MAX)]
 Probability = Annotated[float, msgspec.Meta(ge=0, le=1)]
@@ -94,6 +95,14 @@ class Message(msgspec.Struct, frozen=True, kw_only=True):
 # --- clouds in ------------------------------------------------------------------------------------
 
 
+class ParamsKind(str, Enum):
+    """Which parameters of a cloud come back."""
+
+    FITTED = "fitted"  # kernels solved on the cloud's labels, beyond what the dictionary expects there
+    TRANSPORTED = "transported"  # the kernels of the nearest atoms, carried by optimal transport and refined by the labels
+    NONE = "none"  # none are computed
+
+
 class Cloud(Message, frozen=True, kw_only=True):
     """One scan with its pose: the payload of `in/<robot>/cloud` and of `in/<robot>/integrate`."""
 
@@ -106,6 +115,7 @@ class Cloud(Message, frozen=True, kw_only=True):
     is_return: Array | None = None  # (N,) bool; false = no echo, free up to the point; absent = all true
     robot: Identifier | None = None  # who sends, in kept clouds; on the wire the key says it
     session: Identifier | Absent = ABSENT  # one run of the sender; `seq` grows within it
+    params: ParamsKind | Absent = ABSENT  # what comes back; absent = fitted, where somebody reads it
 
 
 class Pose(Message, frozen=True, kw_only=True):
@@ -149,6 +159,17 @@ class Kernels(Message, frozen=True, kw_only=True):
     residual_var: Finite  # log-odds^2, added in the measure that this sum falls short of 1
     mean_moderation: Finite = 1.0  # share of the latent variance that pulls the mean towards 0.5
     lean: Lean | Absent = ABSENT  # of a map that leans: its latent is this and the sum over the kernels
+    nodes: TileChanges | Absent = ABSENT  # more kernels: nodes of one tile at origin, based on nothing
+
+
+class Borrowed(msgspec.Struct, frozen=True, kw_only=True):
+    """A part of the dictionary that the kernels of a scan lean on, and where it was put."""
+
+    name: str  # of a height model: `heights-` and its number in the dictionary
+    weight: Probability  # share of what is expected: how likely it makes the scan's labels, beside the others
+    displacement: Vector3  # m, map frame: where its origin was put, which is the ground below the sensor
+    slope: Slope  # of that ground along x and y
+    scale: Probability  # of its log-odds: how well the labels bear them out
 
 
 class SectorReport(msgspec.Struct, frozen=True, kw_only=True):
@@ -196,13 +217,14 @@ class Receipt(Message, frozen=True, kw_only=True):
     n_kernels_added: Count = 0  # kernels that the overall map took
     n_kernels_transported: Count = 0  # of those, carried from atoms; the others were placed on the data
     map_kernels: Count = 0  # kernels in the overall map now
-    sectors: list[SectorReport] = []  # how each sector was served
+    sectors: list[SectorReport] = []  # how each sector was served; of transported parameters
     kernels: Kernels | None = None  # the instantaneous map; in replies to `in/<robot>/integrate` only
     next_seq: Count | Absent = ABSENT  # `old_seq` only: the least `seq` of the session that would be taken
+    borrowed: list[Borrowed] | Absent = ABSENT  # what fitted kernels lean on
 
 
 class Params(Message, frozen=True, kw_only=True):
-    """The transported parameters of one cloud: `out/<robot>/params`."""
+    """The parameters of one cloud: `out/<robot>/params`."""
 
     schema: ClassVar[str] = "pot.params.v1"
 
@@ -212,7 +234,8 @@ class Params(Message, frozen=True, kw_only=True):
     stamp_ns: Sequence  # of the cloud
     map_revision: Count  # of the overall map, after this cloud
     kernels: Kernels  # the instantaneous map: this cloud alone
-    sectors: list[SectorReport] = []  # how each sector was served
+    sectors: list[SectorReport] = []  # how each sector was served; of transported parameters
+    borrowed: list[Borrowed] | Absent = ABSENT  # what fitted kernels lean on
 
 
 class Revision(Message, frozen=True, kw_only=True):

@@ -28,7 +28,7 @@ from potschemas.messages import MAX_AXES, MAX_AXIS_LENGTH, Array, DType, ErrorCo
 MessageT = TypeVar("MessageT", bound=Message)
 
 MIME = "application/msgpack"
-# maps and lists inside one another; the deepest message has 6 levels, the rest is for new fields
+# maps and lists inside one another; the deepest message has 7 levels
 MAX_DEPTH = 8
 MAX_ITEMS = 100_000  # entries of one map or list; arrays are bytes, so real messages stay far below
 MAX_VALUES = 100_000  # values and keys in all; a revision tick of 24,000 tiles fits
@@ -172,15 +172,18 @@ def decode_array(
     return _view(array.data, array, name)
 
 
-def pack_array(array: NDArray[Any]) -> Packed:
+def pack_array(array: NDArray[Any], *, repeats: bool = False) -> Packed:
     """An array for the wire, deflated by planes of bytes.
 
+    Args:
+        array: Of a type that travels.
+        repeats: Look for longer repeats, as leans have; in differences there are none, and looking takes time.
     Raises:
         WireError: see `encode_array`.
     """
     dtype, little = _little_endian(array)
     planes = little.reshape(-1).view(np.uint8).reshape(-1, little.itemsize).T
-    deflater = zlib.compressobj(_DEFLATE_LEVEL, strategy=zlib.Z_RLE)
+    deflater = zlib.compressobj(9) if repeats else zlib.compressobj(_DEFLATE_LEVEL, strategy=zlib.Z_RLE)
     deflated = deflater.compress(planes.tobytes()) + deflater.flush()
     return Packed(dtype=dtype, shape=list(array.shape), deflated=deflated)
 

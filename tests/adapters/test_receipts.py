@@ -10,6 +10,7 @@ from potschemas.messages import ReceiptStatus
 from potserver import errors
 from potserver.adapters.receipts import Waited, encode_accepted, encode_params, encode_revision, refusal
 from potserver.domain.types import MapUpdate, Scan, SectorMatch, TileChange
+from potserver.mapping.pipeline import ScanMap
 from tests.tiled_maps import free_kernels
 
 RULE = AnswerRule(observed_activation=0.05, prior_var=50.0, residual_var=20.0, mean_moderation=0.25)
@@ -24,8 +25,7 @@ def test_load_and_shutdown_drop_a_cloud_and_everything_else_rejects_it() -> None
 def update_of(*sectors: SectorMatch) -> MapUpdate:
     return MapUpdate(
         map_revision=1,
-        kernels=free_kernels(4),
-        sectors=list(sectors),
+        own=ScanMap(list(sectors), free_kernels(4), free_kernels(4), True).told,
         n_points=5,
         n_kernels_added=4,
         n_kernels_transported=3,

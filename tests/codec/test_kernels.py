@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import msgspec
 import numpy as np
 import pytest
 
+from potclient.errors import BadReplyError
 from potclient.kernels import KernelSet as ClientKernels
 from potclient.mirror import MapMirror
 from potschemas import messages, wire
 from potschemas.answers import AnswerRule
+from potschemas.lean import LeanTiles
 from potschemas.messages import DType
-from potserver.codec.kernels import code_kernels, encode_kernels
-from potserver.domain.types import KernelSet
+from potserver.codec.kernels import code_kernels, encode_kernels, encode_own_map
+from potserver.domain.types import KernelSet, OwnMap
 from tests.tiled_maps import GRID, asking, free_kernels, lattice_kernels, tiled_state
 
 RULE = AnswerRule(observed_activation=0.05, prior_var=50.0, residual_var=20.0, mean_moderation=0.25)
@@ -131,3 +134,72 @@ def test_no_kernels_are_a_message_too() -> None:
     received = encode_kernels(KernelSet.empty(), RULE)
     assert received.origin == [0.0, 0.0, 0.0]
     assert received.hinge_mean.shape == [0, 3]
+
+
+# --- a scan's own map -------------------------------------------------------------------------------------------------
+
+
+def own_map(planar: bool) -> OwnMap:
+    """Kernels on both lattices, somewhere in the world."""
+    parts = [
+        lattice_kernels(300, spacing_m=GRID.coarse_m, planar=planar),
+        lattice_kernels(500, 1, planar=planar),
+    ]
+    distinct = [part.take(np.unique(part.hinge_mean, axis=0, return_index=True)[1]) for part in parts]
+    nodes = np.full((3, 3, 5), 128, np.uint8)
+    nodes[..., 0] = 200
+    return OwnMap(
+        kernels=KernelSet.concatenate(distinct),
+        origin=np.array([691_608.25, 5_335_799.5, 480.0]),
+        spacings_m=SPACINGS,
+        size_m=GRID.size_m,
+        lean=LeanTiles(10.0, {(69_160, 533_579, 48): nodes}),
+    )
+
+
+def by_place(hinge: np.ndarray) -> np.ndarray:
+    return np.lexsort(hinge.T)
+
+
+@pytest.mark.parametrize("planar", [False, True], ids=["3d", "2d"])
+def test_fitted_kernels_travel_as_nodes_in_whole_steps(planar: bool) -> None:
+    own = own_map(planar)
+    payload = wire.encode(encode_own_map(own, RULE))
+    assert len(payload) < 8 * len(own.kernels), "ten numbers a kernel are 40 bytes"
+    told = wire.decode(payload, messages.Kernels)
+    assert told.hinge_mean.shape == [0, 3], "all stand on lattices"
+    arrived = ClientKernels.from_message(told)
+    assert arrived.rule == RULE
+    local = arrived.hinge_mean - own.origin
+    one, other = by_place(local.round(6)), by_place(own.kernels.hinge_mean.round(6))
+    np.testing.assert_allclose(local[one], own.kernels.hinge_mean[other], atol=1e-6)
+    for name in ("hinge_var", "gamma_shape", "gamma_rate"):
+        np.testing.assert_array_equal(getattr(arrived, name)[one], getattr(own.kernels, name)[other])
+    assert np.abs(arrived.weight_mean[one] - own.kernels.weight_mean[other]).max() <= 0.125 + 1e-6
+    ratio = np.log(arrived.weight_var[one] / own.kernels.weight_var[other])
+    assert np.abs(ratio).max() <= 0.375 + 1e-6
+    assert own.lean is not None
+    assert arrived.lean is not None
+    np.testing.assert_array_equal(
+        arrived.lean.nodes[69_160, 533_579, 48], own.lean.nodes[69_160, 533_579, 48]
+    )
+
+
+def test_carried_kernels_travel_as_they_are() -> None:
+    own = OwnMap(kernels=free_kernels(20), origin=np.array([100.0, 0.0, 0.0]))
+    told = encode_own_map(own, RULE)
+    assert told.nodes is messages.ABSENT
+    assert told.lean is messages.ABSENT
+    arrived = ClientKernels.from_message(told)
+    np.testing.assert_array_equal(arrived.hinge_mean, own.kernels.hinge_mean.astype(np.float32) + own.origin)
+    np.testing.assert_array_equal(arrived.weight_mean, own.kernels.weight_mean)
+
+
+def test_nodes_that_do_not_fit_are_a_bad_reply() -> None:
+    told = encode_own_map(own_map(False), RULE)
+    assert told.nodes is not messages.ABSENT
+    based = msgspec.structs.replace(told.nodes, based=wire.pack_array(np.array([True])))
+    two = msgspec.structs.replace(told.nodes, based=wire.pack_array(np.zeros(2, np.bool_)))
+    for nodes in (based, two):
+        with pytest.raises(BadReplyError):
+            ClientKernels.from_message(msgspec.structs.replace(told, nodes=nodes))

@@ -25,7 +25,8 @@ from potserver.config import Settings, load_settings
 from potserver.domain.dictionary import AtomDictionary
 from potserver.domain.kernel_map import KernelMap
 from potserver.domain.map_state import MapState
-from potserver.domain.types import KernelSet, MapUpdate, Occupancy, Scan, TileChange
+from potserver.domain.types import KernelSet, MapUpdate, Occupancy, OwnMap, ParamsKind, Scan, TileChange
+from potserver.mapping.pipeline import ScanMap
 from potserver.mapping.settings import MappingSettings
 from potserver.server import MapServer
 
@@ -285,6 +286,7 @@ class FakeMapper:
         self.atom_usage: collections.Counter[str] = collections.Counter()
         self.state = MapState(snapshot=FakeSnapshot(self, KernelSet.empty(), 0))  # type: ignore[arg-type]
         self.scans: list[Scan] = []
+        self.params: list[ParamsKind] = []
         self.failure: Exception | None = None
         self.mapping, self.queries, self.warming = Gate(), Gate(), Gate()
 
@@ -300,7 +302,10 @@ class FakeMapper:
         snapshot: Any = FakeSnapshot(self, kernels, self.state.map_revision + 1)
         self.state = dataclasses.replace(self.state, snapshot=snapshot, n_scans=n_scans)
 
-    def integrate(self, scan: Scan, *, commit: Callable[[], None] | None = None) -> MapUpdate:
+    def integrate(
+        self, scan: Scan, *, params: ParamsKind, commit: Callable[[], None] | None = None
+    ) -> MapUpdate:
+        self.params.append(params)
         self.mapping.pass_through()
         if self.failure is not None:
             raise self.failure
@@ -322,8 +327,7 @@ class FakeMapper:
         self._become(whole, self.n_scans + 1)
         return MapUpdate(
             map_revision=self.snapshot.map_revision,
-            kernels=kernels,
-            sectors=[],
+            own=OwnMap.nothing() if params is ParamsKind.NONE else ScanMap([], kernels, kernels, True).told,
             n_points=len(scan.points),
             n_kernels_added=k,
             n_kernels_transported=0,

@@ -47,6 +47,22 @@ def test_integrate_returns_the_receipt_with_its_kernels(map_client: MapClient) -
     assert map_client.integrate(room(), pose(), robot="r7").seq == 2
 
 
+def test_the_sender_says_which_kernels_come_back(map_client: MapClient) -> None:
+    fitted, transported, none = (
+        map_client.integrate(room(), pose(5.0), robot="r8", params=params)
+        for params in ("fitted", "transported", "none")
+    )
+    assert fitted.kernels is not None
+    assert len(fitted.kernels) == fitted.message.n_kernels > 0
+    assert fitted.sectors == []
+    assert transported.kernels is not None
+    assert any(sector.atom_id for sector in transported.sectors)
+    assert none.accepted
+    assert none.kernels is None
+    with pytest.raises(UsageError, match="fitted, transported, none"):
+        map_client.integrate(room(), pose(), params="all")
+
+
 def test_beams_without_return_are_free_to_their_ends(map_client: MapClient) -> None:
     map_client.integrate(room(), pose(), is_return=np.zeros(600, bool))
     answer = map_client.occupancy(0.8 * room())
@@ -201,7 +217,7 @@ def test_two_processes_with_one_robot_id_keep_their_own_receipts(
 
 
 @pytest.mark.usefixtures("numbers_from_one")
-def test_transported_parameters_arrive(map_server: MapServer) -> None:
+def test_parameters_arrive(map_server: MapServer) -> None:
     got: queue.Queue[Any] = queue.Queue()
     with MapClient(map_server.endpoint, feed=FeedOptions(on_params=got.put)) as client:
         client.publish(room(), pose(), robot="p", wait=True)

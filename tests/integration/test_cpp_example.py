@@ -33,7 +33,7 @@ LEFT_OUT = {
     "pot.occupancy.v1": ("gradient", "latent_gradient"),
     "pot.receipt.v1": (
         "queue_depth", "wait_ms", "integrate_ms", "n_points", "n_kernels", "n_kernels_added", "n_kernels_transported",
-        "map_kernels", "sectors", "kernels", "next_seq",
+        "map_kernels", "sectors", "kernels", "next_seq", "borrowed",
     ),
 }  # fmt: skip
 

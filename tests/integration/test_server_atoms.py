@@ -248,7 +248,7 @@ def test_changes_while_clouds_come_in_lose_nothing(serve: Serve, site: Path) -> 
     counters = client.stats().counters
     assert counters["clouds.accepted"] == len(accepted)
     assert (counters["atoms.added"], counters["atoms.removed"]) == (4, 4)
-    receipt = client.integrate(room(99), ORIGIN, robot="r0")
+    receipt = client.integrate(room(99), ORIGIN, robot="r0", params="transported")
     served = {sector.atom_id for sector in receipt.sectors} - {None}
     assert served
     assert served <= set(expected)

@@ -14,6 +14,7 @@ import pytest
 
 from potschemas import messages, wire
 from potschemas.messages import ErrorCode, ReceiptStatus
+from potserver.domain.types import ParamsKind
 from potserver.errors import EmptyError
 
 from .conftest import (
@@ -55,6 +56,51 @@ def test_integrate_replies_with_receipt_and_kernels_and_no_publication(make_rig:
     assert ticks.get(timeout=DEADLINE_S).map_revision == 1
     client.put_cloud(make_cloud(seq=2))
     assert receipts.get(timeout=DEADLINE_S).seq == 2, "the receipt of seq 1 was the reply"
+
+
+def test_parameters_that_nobody_reads_are_not_computed(make_rig: MakeRig) -> None:
+    """Those of a published cloud count as read while anybody listens to the robot's."""
+    rig = make_rig()
+    client = rig.client()
+    receipts = client.receipts("r1")
+
+    def put(seq: int) -> ParamsKind:
+        client.put_cloud(make_cloud(seq=seq))
+        assert receipts.get(timeout=DEADLINE_S).n_kernels == (
+            0 if rig.mapper.params[-1] is ParamsKind.NONE else 120
+        )
+        return rig.mapper.params[-1]
+
+    others = client.listen(client.keys.params("r2"))
+    assert put(1) is ParamsKind.NONE
+    params = client.listen(client.keys.params("r1"))
+    assert put(2) is ParamsKind.FITTED
+    assert params.get(timeout=DEADLINE_S).seq == 2
+    client.put_cloud(make_cloud(seq=9), robot="r2")
+    assert others.get(timeout=DEADLINE_S).seq == 9
+
+
+def test_a_cloud_says_what_it_wants_back(make_rig: MakeRig) -> None:
+    rig = make_rig()
+    client = rig.client()
+    params = client.listen(client.keys.params("*"))
+    for seq, kind in enumerate(messages.ParamsKind):
+        receipt = client.one("integrate", make_cloud(seq=seq, robot="r1", params=kind))
+        assert rig.mapper.params[-1].value == kind.value
+        assert (receipt.kernels is None) == (kind is messages.ParamsKind.NONE)
+    client.put_cloud(make_cloud(seq=3, params=messages.ParamsKind.TRANSPORTED))
+    # who listens gets those of acknowledged clouds too
+    assert [params.get(timeout=DEADLINE_S).seq for _ in range(3)] == [0, 1, 3]
+    assert rig.mapper.params[-1] is ParamsKind.TRANSPORTED
+
+
+def test_published_parameters_that_were_asked_for_need_no_listener(make_rig: MakeRig) -> None:
+    rig = make_rig()
+    client = rig.client()
+    client.put_cloud(make_cloud(params=messages.ParamsKind.FITTED))
+    until(lambda: client.stats().counters.get("params.sent") == 1, "the parameters")
+    client.one("integrate", make_cloud(seq=1, robot="r1"))
+    assert client.stats().counters["params.sent"] == 1, "the reply has them"
 
 
 def test_kernels_far_from_the_origin_keep_their_precision(make_rig: MakeRig) -> None:
@@ -401,7 +447,7 @@ def test_a_full_outbox_does_not_stop_the_mapper(make_rig: MakeRig) -> None:
     node.prompt.post(lambda: gate.wait(DEADLINE_S) and None)
     node.bulk.post(lambda: gate.wait(DEADLINE_S) and None)
     for seq in range(80):
-        client.put_cloud(make_cloud(seq=seq))
+        client.put_cloud(make_cloud(seq=seq, params=messages.ParamsKind.FITTED))
         until(lambda seq=seq: rig.mapper.n_scans == seq + 1, "the scan in the map")
     dropped = client.stats().counters["params.dropped"]
     assert dropped == 80 - 64

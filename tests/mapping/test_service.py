@@ -10,7 +10,7 @@ import pytest
 
 from potserver.domain.dictionary import AtomDictionary
 from potserver.domain.kernel_map import KernelMap
-from potserver.domain.types import MapUpdate, Scan, yaw_pose
+from potserver.domain.types import MapUpdate, ParamsKind, Scan, yaw_pose
 from potserver.errors import EmptyError
 from potserver.mapping.carrying import Carrier
 from potserver.mapping.refinement import borrowed_prior, flat_prior
@@ -19,6 +19,7 @@ from potserver.mapping.settings import PROFILES, MappingSettings
 
 from .kernels import assert_same
 
+TRANSPORTED = ParamsKind.TRANSPORTED
 ROOM = np.array(
     [6.0, 4.0, 2.5]
 )  # m, half the length, width and height; the room is centred on the map's origin
@@ -72,8 +73,8 @@ def test_a_new_dictionary_counts_from_the_next_scan_on(monkeypatch: pytest.Monke
 
     with monkeypatch.context() as patched:
         patched.setattr(Carrier, "match", swap_and_match)
-        first = service.integrate(scan)
-    second = service.integrate(_room_scan(x=0.3))
+        first = service.integrate(scan, params=TRANSPORTED)
+    second = service.integrate(_room_scan(x=0.3), params=TRANSPORTED)
     assert service.dictionary is other
     assert {match.atom_id for match in first.sectors} - {None} == {deep[0].atom_id}
     assert {match.atom_id for match in second.sectors} - {None} == {deep[-1].atom_id}
@@ -109,10 +110,11 @@ def _check_update(update: MapUpdate, service: MappingService) -> None:
 def test_both_profiles_map_a_room(profile: str, planar: bool) -> None:
     service = _service(profile)
     for k in range(3):
-        update = service.integrate(_room_scan(x=0.5 * k, yaw=0.3 * k, seed=k, planar=planar))
+        scan = _room_scan(x=0.5 * k, yaw=0.3 * k, seed=k, planar=planar)
+        update = service.integrate(scan, params=TRANSPORTED)
         _check_update(update, service)
         assert update.map_revision == k + 1
-        assert len(update.kernels), "every cloud gets atoms carried to it"
+        assert len(update.kernels), "atoms are carried to every cloud that asks for them"
         assert any(s.atom_id and s.converged for s in update.sectors)
     assert service.n_scans == 3
     assert sum(service.atom_usage.values()) >= 3
@@ -145,7 +147,7 @@ def test_the_same_scans_give_the_same_map_on_any_number_of_threads() -> None:
             settings=dataclasses.replace(MappingSettings(), **FAST), threads=threads, seed=5
         )
         for k in range(2):
-            update = service.integrate(_room_scan(x=0.4 * k, seed=k, n=2000))
+            update = service.integrate(_room_scan(x=0.4 * k, seed=k, n=2000), params=TRANSPORTED)
         maps.append((service.snapshot.kernels, update.kernels, [s[:7] for s in update.sectors]))
     points, _ = _test_points(_room_scan(seed=50, n=200))
     one, other = (KernelMap(kernels).occupancy(points).mean for kernels, _, _ in maps)
@@ -263,7 +265,7 @@ def test_sectors_without_anything_say_so() -> None:
     ahead = np.abs(np.arctan2(scan.points[:, 1], scan.points[:, 0])) < 0.4
     service = _service(check_share=0.0)
     update = service.integrate(
-        _room_scan(points=scan.points[ahead], is_return=np.ones(int(ahead.sum()), bool))
+        _room_scan(points=scan.points[ahead], is_return=np.ones(int(ahead.sum()), bool)), params=TRANSPORTED
     )
     empty = [s for s in update.sectors if s.n_hits + s.n_free == 0]
     assert len(empty) >= 3
@@ -279,7 +281,7 @@ def test_sectors_without_anything_say_so() -> None:
 def test_sectors_without_hits(profile: str) -> None:
     scan = _room_scan()
     service = _service(profile)
-    update = service.integrate(_room_scan(is_return=scan.points[:, 0] > 0))
+    update = service.integrate(_room_scan(is_return=scan.points[:, 0] > 0), params=TRANSPORTED)
     assert any(s.n_hits == 0 and s.n_free > 0 for s in update.sectors)
     _check_update(update, service)
 
@@ -287,7 +289,7 @@ def test_sectors_without_hits(profile: str) -> None:
 @pytest.mark.parametrize("profile", PROFILES)
 def test_scans_of_beams_without_return_are_free_space(profile: str) -> None:
     service = _service(profile)
-    update = service.integrate(_room_scan(is_return=np.zeros(1200, bool)))
+    update = service.integrate(_room_scan(is_return=np.zeros(1200, bool)), params=TRANSPORTED)
     assert all(s.n_hits == 0 for s in update.sectors)
     _check_update(update, service)
     if profile == "default":
@@ -299,7 +301,7 @@ def test_scans_of_beams_without_return_are_free_space(profile: str) -> None:
 @pytest.mark.parametrize("planar", [False, True])
 def test_without_atoms_the_default_profile_still_maps(planar: bool) -> None:
     service = _service("default", NO_ATOMS)
-    update = service.integrate(_room_scan(planar=planar))
+    update = service.integrate(_room_scan(planar=planar), params=TRANSPORTED)
     assert len(update.kernels) == 0
     assert update.n_kernels_added == len(service.snapshot) > 0
     assert all(s.atom_id is None and s.reason for s in update.sectors)
@@ -324,7 +326,8 @@ def test_every_labelled_point_is_in_one_sector() -> None:
         update = service.integrate(
             _room_scan(
                 points=points, is_return=np.ones(72, bool), T_map_sensor=yaw_pose(0, 0, np.deg2rad(yaw_deg))
-            )
+            ),
+            params=TRANSPORTED,
         )
         assert sum(s.n_hits for s in update.sectors) == 72
 
@@ -336,7 +339,7 @@ def test_dense_scans_are_thinned_to_the_limit() -> None:
 def test_far_and_near_beams_are_cut_as_the_settings_say() -> None:
     service = _service(max_range_m=5.0, min_range_m=1.0)
     points = np.array([[0.5, 0, 0], [3.0, 0, 0], [0, 50.0, 0]], np.float32)
-    update = service.integrate(_room_scan(points=points, is_return=np.ones(3, bool)))
+    update = service.integrate(_room_scan(points=points, is_return=np.ones(3, bool)), params=TRANSPORTED)
     assert update.n_points == 2
     assert sum(s.n_hits for s in update.sectors) == 1
 

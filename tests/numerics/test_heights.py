@@ -39,7 +39,8 @@ def test_the_models_that_make_labels_likely_count() -> None:
     where = np.ones(400)
 
     def mixed(occupied: np.ndarray) -> float:
-        return float(models.likeliest(HeightLabels(where, where, occupied, where)).at(where, where)[0])
+        labels = HeightLabels(where, where, occupied, where)
+        return float(models.mixed(models.shares(labels)).at(where, where)[0])
 
     assert mixed(np.ones(400, bool)) == pytest.approx(2.0, abs=1e-3)
     assert mixed(np.zeros(400, bool)) == pytest.approx(-2.0, abs=1e-3)

@@ -20,6 +20,7 @@ import pytest
         "lattices",
         "learner_curves",
         "mirror",
+        "receipts",
         "service",
         "sessions",
         "standing",

@@ -44,6 +44,7 @@ struct Cloud {  // pot.cloud.v1
     std::optional<Array> is_return;     // (N,) bool; none: all beams have an echo
     std::optional<std::string> robot;
     std::optional<std::string> session;  // of this run of the program: seq grows within it
+    std::optional<std::string> params;   // which kernels come back: fitted, transported or none
 };
 
 struct PointsQuery {  // pot.points_query.v1
@@ -119,7 +120,7 @@ inline Cloud read_cloud(const Bytes& bytes) {
     return {required<int64_t>(f, "seq"),       required<int64_t>(f, "stamp_ns"),
             required_array(f, "points"),       optional_array(f, "T_map_sensor"),
             optional_array(f, "is_return"),    optional<std::string>(f, "robot"),
-            optional<std::string>(f, "session")};
+            optional<std::string>(f, "session"), optional<std::string>(f, "params")};
 }
 
 inline PointsQuery read_points_query(const Bytes& bytes) {
@@ -199,10 +200,11 @@ class Writer {  // one map of named fields
 };
 
 inline Bytes written(const Cloud& c) {
-    Writer writer(c.session ? 7 : 6);  // a field that was added later is left out, never nil
+    Writer writer(6 + (c.session ? 1 : 0) + (c.params ? 1 : 0));  // fields that were added later are left out, never nil
     writer.field("seq", c.seq).field("stamp_ns", c.stamp_ns).field("points", c.points);
     writer.field("T_map_sensor", c.T_map_sensor).field("is_return", c.is_return).field("robot", c.robot);
     if (c.session) writer.field("session", *c.session);
+    if (c.params) writer.field("params", *c.params);
     return writer.bytes();
 }
 

@@ -242,7 +242,7 @@ def _scan_progress(total: int, *, quiet: bool) -> Iterator[Callable[[ScanOutcome
         why = f" ({outcome.reason}: {outcome.message})" if outcome.reason else ""
         took = f"  {outcome.integrate_ms:6.0f} ms" if outcome.status == "accepted" else ""
         kernels = (
-            f"  kernels {outcome.n_kernels} (+{outcome.n_kernels_added})  rev {outcome.map_revision}"
+            f"  kernels {outcome.map_kernels} (+{outcome.n_kernels_added})  rev {outcome.map_revision}"
             if outcome.status == "accepted"
             else ""
         )

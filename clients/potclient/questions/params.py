@@ -1,4 +1,4 @@
-"""`q/params`: the kernels of the overall map, streamed in parts; and the stream of transported parameters."""
+"""`q/params`: the kernels of the overall map, streamed in parts; and the stream of parameters of clouds."""
 
 from __future__ import annotations
 
@@ -47,6 +47,7 @@ def watch_params(link: Link, robot: str, callback: Callable[[TransportedParams],
                 map_revision=message.map_revision,
                 kernels=KernelSet.from_message(message.kernels, map_revision=message.map_revision),
                 sectors=message.sectors,
+                borrowed=message.borrowed or [],
             )
         )
 

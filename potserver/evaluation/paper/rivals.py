@@ -68,7 +68,7 @@ class AbhmPipeline(PotPipeline):
     def own_map(self, seen: LabelledScan, carrier: Carrier, resolution_m: float, clock: Stopwatch) -> ScanMap:
         """What is learned of each sector."""
         with clock("learn"):
-            kernels = KernelSet.concatenate([self._learned(sector) for sector in seen.sectors])
+            kernels = KernelSet.concatenate([self._learned(sector) for sector in self.sectors(seen)])
         own = integrated_out(kernels, planar=seen.scan.is_planar)
         return ScanMap([], own, own, converged=True)
 
