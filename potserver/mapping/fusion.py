@@ -31,7 +31,7 @@ from potserver.mapping.leaning import Expected, lean_of_tiles
 from potserver.mapping.placing import activation, gamma_of_spacing, kernels_at
 from potserver.mapping.refinement import FEATURE_CUT
 from potserver.mapping.settings import MappingSettings
-from potserver.mapping.surfaces import FACE_SAMPLES, FaceSamples, Samples, surface_samples
+from potserver.mapping.surfaces import FACE_SAMPLES, FaceSamples, Samples, faces_of, surface_samples
 from potserver.numerics import evidence
 from potserver.numerics.arrays import UInt8
 from potserver.numerics.beams import Beams, LabelledPoints, beam_weights
@@ -181,18 +181,15 @@ def _samples_of(look: Look, region: Region, options: FusionOptions, threads: int
     parts = [
         Samples(labelled.points - region.origin_m, labelled.occupied.astype(np.uint8), beam_weights(labelled))
     ]
-    if options.gone_odds:
-        seen = evidence.see_through(
-            region.rows, look.beams, start, fine_m=grid.fine_m, odds=options.gone_odds, threads=threads
-        )
-        parts.append(Samples(*seen))
     known = region.rows.take(region.rows.occupied & evidence.is_alive(region.rows))
     where = evidence.positions(known, grid.fine_m)
-    parts.append(
-        surface_samples(
-            look.beams, start, where, 0.5 * grid.fine_m, options.faces, look.rng, planar=look.is_planar
+    faces = faces_of(look.beams, start, where, 0.5 * grid.fine_m, planar=look.is_planar)
+    if options.gone_odds:
+        seen = evidence.see_through(
+            region.rows, look.beams, faces, start, fine_m=grid.fine_m, odds=options.gone_odds, threads=threads
         )
-    )
+        parts.append(Samples(*seen))
+    parts.append(surface_samples(look.beams, start, faces, options.faces, look.rng))
     return Samples.concatenate(parts)
 
 

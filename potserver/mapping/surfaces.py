@@ -45,32 +45,38 @@ class Samples(NamedTuple):
         return Samples(*(np.concatenate(parts) for parts in zip(*sets, strict=True)))
 
 
-def surface_samples(
-    beams: Beams,
-    origin: Float64,
-    known: Float64,
-    voxel_m: float,
-    how: FaceSamples,
-    rng: np.random.Generator,
-    *,
-    planar: bool,
-) -> Samples:
-    """Near samples and shadows of a scan's hits.
+def faces_of(
+    beams: Beams, origin: Float64, known: Float64, voxel_m: float, *, planar: bool
+) -> surface.Normals:
+    """The faces that a scan's H hits lie on.
 
     Args:
         beams: Relative to `origin`.
         origin: (3,) m, in the region's frame.
         known: (R, 3) m, hit rows of the map there: the scan alone may be too sparse to show how a face lies.
         voxel_m: Edge of the voxels whose hits share a normal.
+        planar: Faces are upright, as seen by a planar sensor.
+    """
+    ends = beams.ends[beams.is_return]
+    rays = ends / np.linalg.norm(ends, axis=1, keepdims=True)
+    return surface.normals(ends, rays, known - origin, voxel_m, planar=planar)
+
+
+def surface_samples(
+    beams: Beams, origin: Float64, faces: surface.Normals, how: FaceSamples, rng: np.random.Generator
+) -> Samples:
+    """Near samples and shadows of a scan's hits.
+
+    Args:
+        beams: Relative to `origin`.
+        origin: (3,) m, in the region's frame.
+        faces: Of the hits.
         how: Clearances, depths and weights.
         rng: Of the draws.
-        planar: Faces are upright, as seen by a planar sensor.
     """
     ends = beams.ends[beams.is_return]
     if len(ends) == 0:
         return Samples(np.zeros((0, 3)), np.zeros(0, np.uint8), np.zeros(0))
-    rays = ends / np.linalg.norm(ends, axis=1, keepdims=True)
-    faces = surface.normals(ends, rays, known - origin, voxel_m, planar=planar)
     low, high = how.near_m
     near, _ = surface.near_free(
         ends, np.zeros(3), faces, low_m=low, high_m=high, sigmas=how.near_sigmas, rng=rng

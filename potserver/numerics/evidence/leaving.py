@@ -11,6 +11,12 @@ When that falls below one in `odds`, what stood there has left. Nothing in this 
 background: a far box of few echoes takes more scans than a near one of many, and a fence that lets nine of ten beams through
 stays. Voxels of missed hits that touch each other count together: they are one thing. They are not independent, and neither
 are the beams of one scan, so `odds` must be far higher than what one would bet.
+
+Things leave as a whole. Where a share of the hits around a voxel has left, no more than `odds` to the power of the share that
+stays is asked against it; where next to none stays, nothing. So what lies between the rings goes with what they see through.
+
+Lengths are those of the data: a beam passes what lies before the face that it ends on, across that face and by more than its
+noise. So floors and walls at a grazing angle are not passed, and what stood close before a wall is.
 """
 
 from __future__ import annotations
@@ -25,13 +31,19 @@ from potserver.numerics.arrays import Float64, Int32, Int64, UInt8
 from potserver.numerics.beams import Beams
 from potserver.numerics.evidence.rows import FREE, HIT, MISSED, PASSED, Rows, is_alive, positions
 from potserver.numerics.flag_grid import FlagGrid
+from potserver.numerics.surface import Normals
 from potserver.numerics.threads import parallel_map, spans
-from potserver.numerics.voxel_hash import any_around, empty_table, find, pack
+from potserver.numerics.voxel_hash import empty_table, find, pack
 
-_BEHIND = 0.75  # resolutions that a beam must go on behind a hit to have passed through it; less is a graze, or noise
+# How far before a face, across it, something else stands: so much, and so many standard deviations of the face's noise.
+_MARGIN_M, _SIGMAS = 0.1, 2.0
+_LEAST_COSINE = 0.05  # of the incidence of a beam
+_NEAR = 0.75  # resolutions from an echo to hits that it confirms, at most
 _ALONG = 2  # voxels: hits that a beam passes so near to each other share its one pass, for it may graze
 _PRIOR = 0.5  # of an echo, and of none: beams that each voxel has had before any were counted
 _ONE_SCAN = 3.0  # misses, at most: beams of one scan lie in the same ring, and miss a wire together
+_ALONE = 0.2  # of the hits around a voxel: if no more stay, it goes along though no beam missed it
+_UNSEEN = 0.25  # of a hit that no echo confirms: so much it counts among those that stay
 _WALK = 0.75  # step of a walk along a beam, in voxels of hits
 _BLOCK_SHIFT = 1  # blocks of 2^shift voxels of hits along an edge, at least
 _SPANS = 8  # of beams; the number of threads plays no part in how they are cut
@@ -54,15 +66,30 @@ class _Hits(NamedTuple):
     """The voxels of H rows of hits, ready to be looked up. A voxel is numbered by its last row."""
 
     voxel: Int32  # (H, 3)
+    at: Float64  # (H, 3) m, where the hits lie
     table: Int32
     keys: Int64  # (H,)
     near: FlagGrid  # which blocks of voxels have hits: most of a beam's way leads through blocks without
 
     @staticmethod
-    def of(voxel: Int32) -> _Hits:
+    def of(voxel: Int32, at: Float64) -> _Hits:
         table = empty_table(len(voxel))
         keys = _enter_voxels(voxel, table)
-        return _Hits(voxel, table, keys, FlagGrid.of(voxel, _BLOCK_SHIFT))
+        return _Hits(voxel, at, table, keys, FlagGrid.of(voxel, _BLOCK_SHIFT))
+
+
+class _Echoes(NamedTuple):
+    """The E echoes of a scan, ready to be looked up by their voxels."""
+
+    hits: _Hits
+    following: Int32  # (E,) another echo in the same voxel; -1 after the last
+    normal: Float64  # (E, 3) of the face that it came from
+    margin_m: Float64  # (E,) what lies so near to the plane of that face belongs to it
+
+    @staticmethod
+    def of(at: Float64, faces: Normals, fine_m: float) -> _Echoes:
+        hits = _Hits.of(np.floor(at / (0.5 * fine_m)).astype(np.int32), at)
+        return _Echoes(hits, _chain(hits.keys, hits.table), faces.normal, _MARGIN_M + _SIGMAS * faces.sigma_m)
 
 
 class _Passes(NamedTuple):
@@ -84,6 +111,7 @@ class _Tallies(NamedTuple):
 def see_through(
     rows: Rows,
     beams: Beams,
+    faces: Normals,
     origin: Float64,
     *,
     fine_m: float,
@@ -93,35 +121,40 @@ def see_through(
 ) -> SeenThrough:
     """Take out hits that have left, in place, and say what else the beams of a scan tell about hits that they pass through.
 
-    A beam passes through the voxels of hits on its way, up to three quarters of a resolution before its end. Where it passes
-    several within two voxels of each other, each gets its share of one beam: it may graze a surface. A voxel is still there
-    if an echo of the scan lies in it or in one that touches it.
+    A beam passes through the voxels of hits on its way, but for those on the face that it ends on. Where it passes several
+    within two voxels of each other, each gets its share of one beam: it may graze a surface. A voxel is still there if an echo
+    of the scan lies in it or in one that touches it, on the same face.
 
     Args:
         rows: The sums of rows of hits and tallies are changed.
         beams: B beams, relative to their start.
+        faces: That their E echoes lie on.
         origin: (3,) m, the beams' start in the rows' frame.
         fine_m: The resolution.
         odds: Against missing what is still there; beyond them it has left.
         most_followed: Beams. Of more, every second, third ... is followed, and counts for those left out.
         threads: Threads to spread the beams over.
     Returns:
-        Samples to add: tallies at the centres of their voxels, free space where the rows stood that were taken out.
+        Samples to add: tallies at the centres of their voxels, free space where beams passed the rows that were taken out.
     """
     hit_rows = np.flatnonzero(rows.occupied & is_alive(rows))
     ends = beams.ends + origin
-    new = np.floor(ends[beams.is_return] / (0.5 * fine_m)).astype(np.int32)
-    voxel = np.concatenate([new, rows.voxel[hit_rows]])
+    echoes = _Echoes.of(ends[beams.is_return], faces, fine_m)
+    known = rows.take(hit_rows)
+    voxel = np.concatenate([echoes.hits.voxel, known.voxel])
     if len(voxel) == 0 or len(ends) == 0:
         return SeenThrough.nothing()
-    hits = _Hits.of(voxel)
+    hits = _Hits.of(voxel, np.concatenate([echoes.hits.at, positions(known, fine_m)]))
     every = -(-len(ends) // most_followed)
-    followed = Beams(ends[::every], beams.is_return[::every])
-    passes = _follow(followed, origin, hits, fine_m, threads)
+    before = np.zeros(len(ends))
+    before[beams.is_return] = echoes.margin_m / np.maximum(faces.cosine, _LEAST_COSINE)
+    passes = _follow(
+        np.ascontiguousarray(ends[::every]), before[::every].copy(), origin, hits, fine_m, threads
+    )
     tallies = _Tallies(*_tallies(rows.voxel, rows.kind, rows.sums[:, 3], hits.table, hits.keys))
     passing = every * np.bincount(passes.hit, _shares(hits.voxel, *passes), len(voxel))
     asked = np.flatnonzero((passing > 0) | (tallies.missed > 0))
-    is_missed = _is_lonely(hits.voxel[asked], new, empty_table(len(new)))
+    is_missed = _is_lonely(asked, hits, echoes, _NEAR * fine_m)
     there, missed = asked[~is_missed], asked[is_missed]
     beams_around, hits_around, passed_around = (
         _around(missed, of_voxel, hits.voxel, hits.table, hits.keys)
@@ -129,15 +162,18 @@ def see_through(
     )
     new_misses = -_ONE_SCAN * np.expm1(-beams_around / _ONE_SCAN)
     in_a_row = tallies.missed[missed] + new_misses
-    has_left = _log_missed(hits_around, passed_around, in_a_row) < -np.log(odds)
-    gone = missed[has_left]
-    still = missed[~has_left]
-    where = positions(rows.take(hit_rows[gone - len(new)]), fine_m)
-    _take_out(rows, tallies, there, gone)
+    chance = np.zeros(len(voxel))  # log; of those that no beam missed it is that of the certain
+    chance[missed] = _log_missed(hits_around, passed_around, in_a_row)
+    gone = chance < -np.log(odds)
+    _take_along(gone, chance, tallies.hits, hits, echoes, _NEAR * fine_m, np.log(odds))
+    has_left = gone[missed]
+    free, still = missed[has_left], missed[~has_left]
+    where = positions(rows.take(hit_rows[free - len(echoes.margin_m)]), fine_m)
+    _take_out(rows, tallies, there, np.flatnonzero(gone))
     centres = (hits.voxel + 0.5) * (0.5 * fine_m)
     return SeenThrough(
         np.concatenate([centres[there], centres[still], where]),
-        np.repeat(np.array([PASSED, MISSED, FREE], np.uint8), [len(there), len(still), len(gone)]),
+        np.repeat(np.array([PASSED, MISSED, FREE], np.uint8), [len(there), len(still), len(free)]),
         np.concatenate([(tallies.missed + passing)[there], new_misses[~has_left], in_a_row[has_left]]),
     )
 
@@ -152,20 +188,22 @@ def _take_out(rows: Rows, tallies: _Tallies, there: Int64, gone: Int64) -> None:
     rows.sums[out] = 0.0
 
 
-def _follow(beams: Beams, origin: Float64, hits: _Hits, fine_m: float, threads: int) -> _Passes:
-    """Where beams pass through voxels with hits; their ends are in the rows' frame."""
+def _follow(
+    ends: Float64, before: Float64, origin: Float64, hits: _Hits, fine_m: float, threads: int
+) -> _Passes:
+    """Where beams pass through voxels with hits, so far before their ends; all in the rows' frame."""
 
     def run(span: tuple[int, int]) -> _Passes:
         a, b = span
         room = 4 * (b - a) + 1024
         while True:
             found, beam = np.empty(room, np.int32), np.empty(room, np.int32)
-            n = _passes(beams.ends[a:b], origin, hits, fine_m, found, beam)
+            n = _passes(ends[a:b], before[a:b], origin, hits, fine_m, found, beam)
             if n <= room:
                 return _Passes(found[:n], beam[:n] + np.int32(a))
             room = n
 
-    parts = parallel_map(run, spans(len(beams.ends), _SPANS), threads)
+    parts = parallel_map(run, spans(len(ends), _SPANS), threads)
     return _Passes(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
 
 
@@ -253,12 +291,12 @@ def _shares(voxel, hit, beam):
 
 
 @nb.njit(nogil=True, error_model="numpy", cache=True)
-def _passes(ends, origin, hits, fine_m, found, beam):
+def _passes(ends, before, origin, hits, fine_m, found, beam):
     """How often beams pass through voxels with hits; which voxels and beams, as far as `found` and `beam` have room.
 
     The buffers do not grow in here: numba would count references in every step, which takes three times as long.
     """
-    table, keys, (corner, shift, is_near) = hits.table, hits.keys, hits.near
+    table, keys, at, (corner, shift, is_near) = hits.table, hits.keys, hits.at, hits.near
     n = 0
     edge = 0.5 * fine_m
     ox, oy, oz = origin[0] / edge, origin[1] / edge, origin[2] / edge  # from here on in voxels
@@ -270,10 +308,10 @@ def _passes(ends, origin, hits, fine_m, found, beam):
         dx /= length
         dy /= length
         dz /= length
-        stop = length - 2.0 * _BEHIND
+        stop = length - before[b] / edge
         s = 0.5 * _WALK
         last = np.int64(-1)
-        while s < stop:
+        while s < stop + 1.0:
             x = np.int64(np.floor(ox + dx * s))
             y = np.int64(np.floor(oy + dy * s))
             z = np.int64(np.floor(oz + dz * s))
@@ -288,7 +326,11 @@ def _passes(ends, origin, hits, fine_m, found, beam):
                 continue
             last = key
             r = table[find(table, keys, key)]
-            if r < 0:
+            if (
+                r < 0
+                or (at[r, 0] / edge - ox) * dx + (at[r, 1] / edge - oy) * dy + (at[r, 2] / edge - oz) * dz
+                > stop
+            ):
                 continue
             if n < len(found):
                 found[n] = r
@@ -298,15 +340,100 @@ def _passes(ends, origin, hits, fine_m, found, beam):
 
 
 @nb.njit(nogil=True, error_model="numpy", cache=True)
-def _is_lonely(voxel, new, table):
-    """(V,) whether none of the new voxels is a voxel or touches it."""
-    keys = np.empty(len(new), np.int64)
-    for i in range(len(new)):
-        keys[i] = pack(1, new[i, 0], new[i, 1], new[i, 2])
+def _chain(keys, table):
+    """(E,) for each entry another one of its key, so that all are met from the one in the table; -1 after the last."""
+    following = np.full(len(keys), -1, np.int32)
+    before = np.full(len(table), -1, np.int32)
+    for i in range(len(keys)):
         place = find(table, keys, keys[i])
-        if table[place] < 0:
-            table[place] = i
-    lonely = np.empty(len(voxel), np.bool_)
-    for i in range(len(voxel)):
-        lonely[i] = not any_around(table, keys, 1, voxel[i], 1)
+        following[i] = before[place]
+        before[place] = i
+    return following
+
+
+@nb.njit(nogil=True, error_model="numpy", cache=True)
+def _is_there(v, hits, echoes, reach_m):
+    """Whether an echo lies in a voxel or in one that touches it, on a face that what stood in the voxel belongs to."""
+    table, keys = echoes.hits.table, echoes.hits.keys
+    x, y, z = hits.voxel[v]
+    for dx in range(-1, 2):
+        for dy in range(-1, 2):
+            for dz in range(-1, 2):
+                e = table[find(table, keys, pack(1, x + dx, y + dy, z + dz))]
+                while e >= 0:
+                    across, apart = 0.0, 0.0
+                    for c in range(3):
+                        d = echoes.hits.at[e, c] - hits.at[v, c]
+                        across += d * echoes.normal[e, c]
+                        apart += d * d
+                    if abs(across) <= echoes.margin_m[e] and apart <= reach_m * reach_m:
+                        return True
+                    e = echoes.following[e]
+    return False
+
+
+@nb.njit(nogil=True, error_model="numpy", cache=True)
+def _is_lonely(asked, hits, echoes, reach_m):
+    """(A,) whether no echo of the scan says that a voxel of hits is still there."""
+    lonely = np.empty(len(asked), np.bool_)
+    for i in range(len(asked)):
+        lonely[i] = not _is_there(asked[i], hits, echoes, reach_m)
     return lonely
+
+
+@nb.njit(nogil=True, error_model="numpy", cache=True)
+def _take_along(gone, chance, weight, hits, echoes, reach_m, log_odds):
+    """Let voxels that touch what has left go with it, in place: a thing leaves as a whole.
+
+    Args:
+        gone: (V,) which voxels have left by themselves.
+        chance: (V,) log of the probability that the beams missed what is still there.
+        weight: (V,) of their hits.
+        hits, echoes: The voxels; what the scan found.
+        reach_m: From an echo to hits that it confirms.
+        log_odds: Against missing what is still there.
+    """
+    voxel, table, keys = hits.voxel, hits.table, hits.keys
+    state = np.zeros(len(gone), np.uint8)
+    queue = np.flatnonzero(gone)
+    waiting = [queue[i] for i in range(len(queue))]
+    around = np.empty(27, np.int64)
+    beside = np.empty(27, np.int64)
+    while len(waiting) > 0:
+        v = waiting.pop()
+        for i in range(_touching(voxel[v], table, keys, around)):
+            u = around[i]
+            if gone[u] or weight[u] <= 0.0 or _is_staying(u, state, hits, echoes, reach_m):
+                continue
+            stays, left = 0.0, 0.0
+            for j in range(_touching(voxel[u], table, keys, beside)):
+                w = beside[j]
+                if gone[w]:
+                    left += weight[w]
+                elif weight[w] > 0.0:
+                    stays += weight[w] * (1.0 if _is_staying(w, state, hits, echoes, reach_m) else _UNSEEN)
+            if chance[u] <= -log_odds * max(0.0, stays / (stays + left) - _ALONE):
+                gone[u] = True
+                waiting.append(u)
+
+
+@nb.njit(nogil=True, error_model="numpy", cache=True)
+def _touching(at, table, keys, found):
+    """How many voxels are or touch a (3,) one; their numbers, into `found` (27,)."""
+    n = 0
+    for dx in range(-1, 2):
+        for dy in range(-1, 2):
+            for dz in range(-1, 2):
+                v = table[find(table, keys, pack(1, at[0] + dx, at[1] + dy, at[2] + dz))]
+                if v >= 0:
+                    found[n] = v
+                    n += 1
+    return n
+
+
+@nb.njit(nogil=True, error_model="numpy", cache=True)
+def _is_staying(v, state, hits, echoes, reach_m):
+    """`_is_there`, found out once."""
+    if state[v] == 0:
+        state[v] = 1 if _is_there(v, hits, echoes, reach_m) else 2
+    return state[v] == 1

@@ -20,6 +20,7 @@ from potserver.numerics.evidence import (
     positions,
     see_through,
 )
+from potserver.numerics.surface import Normals
 from tests.numerics.evidence.samples import FINE_M, rows_of
 
 PLACE = [[3.0, 0.01, 0.01]]
@@ -29,7 +30,14 @@ def _see_through(rows: Rows, ends, is_return, **changes) -> SeenThrough:
     ends = np.atleast_2d(np.asarray(ends, float))
     options = {"fine_m": FINE_M, "odds": 300.0} | changes
     beams = Beams(ends, np.broadcast_to(is_return, len(ends)).copy())
-    return see_through(rows, beams, np.zeros(3), **options)
+    faces = options.pop("faces", _faces(ends[beams.is_return]))
+    return see_through(rows, beams, faces, np.zeros(3), **options)
+
+
+def _faces(hits: np.ndarray, normal=(-1.0, 0.0, 0.0), sigma_m: float = 0.02) -> Normals:
+    """The hits lie on planes of one direction; x of its normal is minus the cosine of incidence of beams along x."""
+    n = len(hits)
+    return Normals(np.tile(np.asarray(normal, float), (n, 1)), np.full(n, -normal[0]), np.full(n, sigma_m))
 
 
 def _looks(rows: Rows, ends, is_return, n: int = 1, **changes) -> Rows:
@@ -140,8 +148,45 @@ def test_beams_left_out_are_stood_for() -> None:
 
 def test_a_hit_beside_a_new_one_stays() -> None:
     rows = rows_of([[3.0, 0.01, 0.0]], True, [50.0])
-    _see_through(rows, np.concatenate([_fan(20), [[3.0, 0.19, 0.0]]]), True)
+    _see_through(rows, np.concatenate([_fan(20), [[3.0, 0.14, 0.0]]]), True)
     assert is_alive(rows).all()
+
+
+def test_a_face_close_behind_does_not_say_that_what_stood_before_it_is_there() -> None:
+    """The hits lie in voxels that touch: the new ones are .17 m farther on, across their own face."""
+    rows = rows_of([[3.0, 0.01, 0.01]], True, [50.0])
+    _see_through(rows, _fan(20, at_m=3.17), True)
+    assert not is_alive(rows).any()
+    noisy = rows_of([[3.0, 0.01, 0.01]], True, [50.0])
+    ends = _fan(20, at_m=3.17)
+    _see_through(noisy, ends, True, faces=_faces(ends, sigma_m=0.05))
+    assert is_alive(noisy).all(), "within twice the noise of the face"
+
+
+def test_what_lies_on_the_face_that_beams_graze_is_not_passed() -> None:
+    """.3 m before their ends along the beams, 3 cm across the face. Of a face seen head-on that would be far."""
+    tilted, ends = (-0.1, 0.0, math.sqrt(0.99)), _fan(20, at_m=3.5)
+    grazed, seen_through = rows_of([[3.2, 0.01, 0.01]], True), rows_of([[3.2, 0.01, 0.01]], True)
+    assert len(_see_through(grazed, ends, True, faces=_faces(ends, tilted)).weight) == 0
+    assert len(_see_through(seen_through, ends, True).weight) > 0
+
+
+def test_what_touches_leaves_as_a_whole() -> None:
+    """Beams pass the middle only. What has few hits beside it goes along, though none passed it; no beam says it is free."""
+    middle, edge, far = [3.0, 0.01, 0.01], [3.0, 0.01, 0.25], [3.0, 0.01, 0.65]
+    rows = rows_of([middle, edge, far], True, [40.0, 2.0, 40.0])
+    seen = _see_through(rows, _fan(24), False)
+    assert rows.sums[:, 3].tolist() == [0.0, 0.0, 40.0]
+    np.testing.assert_allclose(seen.points[seen.kind == FREE], [middle], atol=1e-6)
+
+
+def test_what_an_echo_confirms_keeps_what_touches_it() -> None:
+    """Before a wall a thing with many hits leaves; the wall behind it stays, where rings meet it and between them."""
+    thing, wall = [3.0, 0.01, 0.01], [[3.1, 0.01, 0.01], [3.1, 0.01, 0.11], [3.1, 0.01, -0.09]]
+    rows = rows_of([thing, *wall], True, [60.0, 20.0, 20.0, 20.0])
+    ends = np.concatenate([_fan(24), np.array([[3.1, 0.01, 0.01]])])
+    _see_through(rows, ends, True)
+    assert (rows.sums[1:, 3] > 0.0).all()
 
 
 def test_what_stands_just_before_a_wall_can_leave_too() -> None:
@@ -184,7 +229,7 @@ def test_beams_are_relative_to_their_origin() -> None:
     )
     expected = _see_through(at_home, _fan(24), True)
     beams = Beams(_fan(24), np.ones(24, bool))
-    seen = see_through(moved, beams, 2.0 * origin, fine_m=FINE_M, odds=300.0)
+    seen = see_through(moved, beams, _faces(beams.ends), 2.0 * origin, fine_m=FINE_M, odds=300.0)
     np.testing.assert_allclose(seen.points - 2.0 * origin, expected.points, atol=1e-5)
     np.testing.assert_array_equal(seen.kind, expected.kind)
     np.testing.assert_allclose(seen.weight, expected.weight, rtol=1e-5)
