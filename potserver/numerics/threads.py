@@ -12,6 +12,8 @@ from concurrent.futures import ThreadPoolExecutor, wait
 from functools import cache
 from typing import TypeVar
 
+from threadpoolctl import threadpool_limits
+
 T = TypeVar("T")
 R = TypeVar("R")
 
@@ -19,6 +21,15 @@ R = TypeVar("R")
 def default_threads() -> int:
     """The processors that this process may use."""
     return max(1, len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1)
+
+
+def use_one_blas_thread() -> None:
+    """Let numpy's linear algebra stay on the thread that asks for it, in all of this process; for programs only.
+
+    Its products are too small here to be shared out, and its threads wait for the next one by spinning: a tenth of what a
+    server needed. Sums would also depend on the number of processors.
+    """
+    threadpool_limits(1, user_api="blas")
 
 
 @cache
