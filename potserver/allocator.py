@@ -1,7 +1,7 @@
 """The C library's allocator, told to give memory back. A map is many small arrays that live long among large ones that do not.
 
-Left alone, glibc keeps a heap for each thread and every hole in them: a map of 34 MB held 116. And what a scan works in goes back
-to the system page by page, which clears 4,000 new pages for the next one. On other C libraries this does nothing.
+Left alone, glibc keeps a heap for each thread and every hole in them: a map of 34 MB held 116. And what a scan works in goes
+back to the system page by page, which clears 4,000 new pages for the next one. On other C libraries this does nothing.
 """
 
 from __future__ import annotations

@@ -14,6 +14,8 @@ from typing import TypeVar
 
 from threadpoolctl import threadpool_limits
 
+from potserver.thread_names import show_name
+
 T = TypeVar("T")
 R = TypeVar("R")
 
@@ -34,7 +36,7 @@ def use_one_blas_thread() -> None:
 
 @cache
 def _pool(threads: int, lane: str) -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(threads, thread_name_prefix=f"numerics-{lane}")
+    return ThreadPoolExecutor(threads, thread_name_prefix=f"numerics-{lane}", initializer=show_name)
 
 
 def parallel_map(function: Callable[[T], R], items: Iterable[T], threads: int, lane: str = "map") -> list[R]:
