@@ -95,10 +95,11 @@ fix: $(READY) ## repair style and format; write the generated schemas
 	$(BIN)/python -m potschemas.generate
 	$(BIN)/potserver config show --markdown > docs/settings.md
 
-bench: $(READY) ## benchmarks; table here, numbers into out/bench/bench.json
+bench: $(READY) ## benchmarks; tables here, numbers into out/bench
 	@mkdir -p out/bench
 	@$(BIN)/python -m pytest benchmarks --benchmark-only --benchmark-json=out/bench/bench.json $(ARGS)
-	@echo "bench: results above, and in out/bench/bench.json"
+	@$(BIN)/python benchmarks/ratios.py bundled:rooms --peers octomap:0.2,bgk-gap:0.2 --json out/bench/ratios.json
+	@echo "bench: results above, and in out/bench"
 
 torture: $(READY) ## faults, damage, hostile messages and kills; some minutes. ARGS='--help' tells of longer runs
 	@$(BIN)/python benchmarks/torture.py $(ARGS)

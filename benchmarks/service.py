@@ -14,25 +14,24 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import os
-import platform
 import signal
-import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
+from rich.console import Console
 
 from benchmarks.server_process import ServerProcess
-from benchmarks.shared import keep, parser_of
+from benchmarks.shared import keep, machine, parser_of, spread
 from potclient import MapClient
 from potclient.datasets import RecordedScan, open_dataset
 from potclient.loadtest import LoadReport, LoadSettings, run_load
 from potclient.session import SessionOptions
+from potserver.commands.shared import table
 
 _TIMEOUT_S = 120.0
 _SHARES = (0.03125, 0.125, 0.5, 1.0)  # of a scan's points
@@ -42,7 +41,7 @@ _ROBOTS = (1, 2, 4)
 def main() -> int:
     options = _options()
     scans = list(open_dataset(options.dataset, min_range_m=options.min_range, max_range_m=options.max_range))
-    found: dict[str, Any] = {"machine": _machine(), "dataset": options.dataset}
+    found: dict[str, Any] = {"machine": machine(), "dataset": options.dataset}
     if options.sweep:
         found |= _sweep(scans, options)
         keep(options, found, lambda: _draw(found))
@@ -81,6 +80,16 @@ class _Server:
         fields = stat.rpartition(")")[2].split()
         return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
+    def cpu_ms_of_threads(self) -> dict[str, float]:
+        """Of its threads since their start, by name; those of a pool together. Linux keeps names of 15 characters."""
+        found: dict[str, float] = {}
+        for task in Path(f"/proc/{self._process.popen.pid}/task").iterdir():
+            head, _, rest = (task / "stat").read_text().rpartition(")")
+            name, fields = head.partition("(")[2].rstrip("0123456789").rstrip("-_"), rest.split()
+            ms = 1e3 * (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+            found[name] = found.get(name, 0.0) + ms
+        return found
+
     def __enter__(self) -> _Server:
         return self
 
@@ -99,11 +108,26 @@ def _load(options: argparse.Namespace) -> dict[str, Any]:
     )
     recording = open_dataset(options.dataset, min_range_m=options.min_range, max_range_m=options.max_range)
     with tempfile.TemporaryDirectory() as folder, _Server(folder, options) as server:
-        before_s = server.cpu_s()
+        before_s, before_ms = server.cpu_s(), server.cpu_ms_of_threads()
         report = run_load(settings, recording, options=SessionOptions(connect=(server.endpoint,)))
         cpu_s = server.cpu_s() - before_s
+        threads = {name: ms - before_ms.get(name, 0.0) for name, ms in server.cpu_ms_of_threads().items()}
     _say_load(report, cpu_s)
-    return report.to_json() | {"server_cpu_s": cpu_s}
+    _say_threads(threads, report)
+    return report.to_json() | {"server_cpu_s": cpu_s, "cpu_ms_of_threads": threads}
+
+
+def _say_threads(cpu_ms: dict[str, float], report: LoadReport) -> None:
+    """What each thread needed of a scan; those that answer questions need it of so many questions."""
+    n_scans = max(report.clouds.accepted, 1)
+    whole = sum(cpu_ms.values())
+    rows = [
+        (name, f"{ms / n_scans:.1f}", f"{ms / whole:.0%}")
+        for name, ms in sorted(cpu_ms.items(), key=lambda item: -item[1])
+        if ms >= 0.005 * whole
+    ]
+    Console(width=100).print(table(("thread", "CPU ms a scan", "share"), rows, left=(0,)))
+    print(f"{report.queries.n / n_scans:.1f} questions a scan")
 
 
 def _say_load(report: LoadReport, cpu_s: float) -> None:
@@ -126,12 +150,12 @@ def _sweep(scans: list[RecordedScan], options: argparse.Namespace) -> dict[str, 
     for share in _SHARES:
         ms, sizes = zip(*_costs([_thinned(scan, share) for scan in scans], options), strict=True)
         by_points.append({"points": len(scans[0].points) * share, "cpu_ms": ms, "kernels": sizes})
-        print(f"{share:7.1%} of the points: {_spread(ms)} CPU ms a scan")
+        print(f"{share:7.1%} of the points: {spread(ms)} CPU ms a scan")
     by_robots = []
     for n in _ROBOTS:
         ms, _ = zip(*_costs([_thinned(scan, _SHARES[1]) for scan in scans], options, n_robots=n), strict=True)
         by_robots.append({"robots": n, "cpu_ms": ms})
-        print(f"{n} robots: {_spread(ms)} CPU ms a scan")
+        print(f"{n} robots: {spread(ms)} CPU ms a scan")
     return {"points": by_points, "robots": by_robots}
 
 
@@ -156,18 +180,6 @@ def _costs(
 def _thinned(scan: RecordedScan, share: float) -> RecordedScan:
     every = round(1.0 / share)
     return dataclasses.replace(scan, points=scan.points[::every], is_return=scan.is_return[::every])
-
-
-def _spread(values: Any) -> str:
-    low, middle, high = np.quantile(values, (0.1, 0.5, 0.9))
-    return f"{middle:.0f} [{low:.0f}-{high:.0f}]"
-
-
-def _machine() -> str:
-    """What was measured on, and which commit."""
-    commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True).stdout
-    load = ", ".join(f"{n:.0f}" for n in os.getloadavg())
-    return f"{os.cpu_count()} processors ({platform.machine()}), load {load}, commit {commit.strip()}, {time.strftime('%F')}"
 
 
 def _draw(found: dict[str, Any]) -> Figure:

@@ -25,11 +25,13 @@ from potserver.adapters.receipts import Waited, encode_accepted, encode_params
 from potserver.codec.clouds import encode_cloud, read_cloud
 from potserver.commands.shared import table
 from potserver.domain.types import MapUpdate, Scan
+from potserver.numerics.threads import use_one_blas_thread
 from potserver.recordings import to_scan
 from potserver.storage.seal import sealed
 
 
 def main() -> int:
+    use_one_blas_thread()
     options = _options()
     recording = open_dataset(options.dataset, min_range_m=options.min_range, max_range_m=options.max_range)
     first = to_scan(recording[0], 0)

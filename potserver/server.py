@@ -23,7 +23,6 @@ from potclient.client import MapClient
 from potschemas import __version__, keys, messages
 from potserver.adapters.presence import OtherServers, SessionWatch
 from potserver.adapters.query_pool import QueryPool
-from potserver.adapters.questions.registry import warm_up
 from potserver.adapters.session import (
     build_config,
     close_session,
@@ -33,6 +32,7 @@ from potserver.adapters.session import (
 )
 from potserver.adapters.stats import StatsPublisher, stats_now
 from potserver.atoms.store import AtomStore
+from potserver.compiling import warm_up
 from potserver.config import Settings, as_tree
 from potserver.domain.dictionary import AtomDictionary
 from potserver.domain.order import Heard
@@ -326,8 +326,7 @@ class MapServer:
 
 def _warm_up(mapper: MappingService) -> None:
     started_s = time.perf_counter()
-    mapper.warm_up()
-    warm_up()
+    warm_up(mapper)
     log.info("server_warmed_up", elapsed_ms=round((time.perf_counter() - started_s) * 1e3, 1))
 
 

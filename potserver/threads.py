@@ -6,6 +6,7 @@ import threading
 from collections.abc import Callable
 
 from potserver.log import get_logger
+from potserver.thread_names import show_name
 
 log = get_logger("potserver.threads")
 
@@ -14,6 +15,7 @@ def spawn(name: str, target: Callable[[], None]) -> threading.Thread:
     """Start a daemon thread that logs how it died, if it dies."""
 
     def run() -> None:
+        show_name()
         try:
             target()
         except Exception:

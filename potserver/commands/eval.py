@@ -141,8 +141,9 @@ def _run(options: argparse.Namespace) -> int:
         return eval_paper.run(options)
     eval_paper.refuse_flags(options)
     from potserver.log import configure_logging
-    from potserver.numerics.threads import default_threads
+    from potserver.numerics.threads import default_threads, use_one_blas_thread
 
+    use_one_blas_thread()
     settings = settings_of(options)
     configure_logging("warning", "console")
     dictionary = dictionary_of(settings.dictionary)

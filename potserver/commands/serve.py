@@ -78,7 +78,9 @@ def _run(options: argparse.Namespace) -> int:
     import zenoh
 
     from potserver.log import configure_logging, get_logger
+    from potserver.numerics.threads import use_one_blas_thread
 
+    use_one_blas_thread()
     settings = settings_of(options)
     configure_logging(settings.log.level, settings.log.format)
     zenoh.try_init_log_from_env()  # RUST_LOG

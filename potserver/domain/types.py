@@ -81,7 +81,12 @@ class Scan:
     @property
     def beams(self) -> Beams:
         """The beams in a frame at the sensor with the map's axes."""
-        return Beams(self.points.astype(np.float64) @ self.T_map_sensor[:3, :3].T, self.is_return)
+        return self.beams_at(slice(None))
+
+    def beams_at(self, index: NDArray[np.intp] | slice) -> Beams:
+        """Some of `beams`, by a numpy index: most scans have more than a map takes."""
+        R = self.T_map_sensor[:3, :3]
+        return Beams(self.points[index].astype(np.float64) @ R.T, self.is_return[index])
 
 
 def check_rigid(transform: Float64, tolerance: float = 1e-3) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 from potserver.domain.types import Scan
 from potserver.errors import EmptyError
 from potserver.mapping.settings import MappingSettings
-from potserver.numerics.beams import Beams, LabelledPoints, limit_range
+from potserver.numerics.beams import Beams, LabelledPoints, cut_range, long_enough
 
 _MOST_CHECKED = 100  # beams a scan, about
 
@@ -60,21 +60,19 @@ def draw_beams(scan: Scan, limits: BeamLimits, draws: Draws) -> DrawnBeams:
     Raises:
         EmptyError: no beam is long enough.
     """
-    beams = limit_range(scan.beams, limits.min_range_m, limits.max_range_m)
-    n = len(beams.ends)
-    if n == 0:
+    drawn = long_enough(scan.points, limits.min_range_m)
+    if len(drawn) == 0:
         raise EmptyError(
             f"none of {len(scan.points)} beams is longer than {limits.min_range_m} m: nothing to learn from"
         )
-    drawn = np.arange(n)
-    if n > limits.beams_per_scan:
-        drawn = np.sort(draws.learn.choice(n, limits.beams_per_scan, replace=False))
+    if len(drawn) > limits.beams_per_scan:
+        drawn = drawn[np.sort(draws.learn.choice(len(drawn), limits.beams_per_scan, replace=False))]
     is_checked = draws.check.random(len(drawn)) < min(limits.check_share, _MOST_CHECKED / len(drawn))
     is_checked[0] &= not is_checked.all()  # something must be learned
-    learned, checked = drawn[~is_checked], drawn[is_checked]
+    beams = cut_range(scan.beams_at(drawn), limits.max_range_m)
     return DrawnBeams(
-        Beams(beams.ends[learned], beams.is_return[learned]),
-        Beams(beams.ends[checked], beams.is_return[checked]),
+        Beams(beams.ends[~is_checked], beams.is_return[~is_checked]),
+        Beams(beams.ends[is_checked], beams.is_return[is_checked]),
     )
 
 

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numba as nb
 import numpy as np
 
-from potserver.numerics.arrays import Bool, Float64, Int64
+from potserver.numerics.arrays import Bool, Float64, Floats, Int64
 
 
 class LabelledPoints(NamedTuple):
@@ -27,12 +27,22 @@ class Beams(NamedTuple):
 
 def limit_range(beams: Beams, min_range_m: float, max_range_m: float) -> Beams:
     """Leave out beams shorter than `min_range_m`; cut longer ones than `max_range_m`, which then end without an echo."""
+    keep = long_enough(beams.ends, min_range_m)
+    return cut_range(Beams(beams.ends[keep], beams.is_return[keep]), max_range_m)
+
+
+def long_enough(ends: Floats, min_range_m: float) -> Int64:
+    """Numbers of those of (N, 3) ends that are as far as `min_range_m` from the start, and not at it."""
+    squared = np.einsum("ij,ij->i", ends, ends, dtype=np.float64)
+    return np.flatnonzero((squared >= min_range_m**2) & (squared > 0))
+
+
+def cut_range(beams: Beams, max_range_m: float) -> Beams:
+    """Cut longer beams than `max_range_m`, which then end without an echo; all are longer than 0."""
     length = np.linalg.norm(beams.ends, axis=1)
-    keep = (length >= min_range_m) & (length > 0)
-    ends, length, is_return = beams.ends[keep], length[keep], beams.is_return[keep]
     too_long = length > max_range_m
     scale = np.where(too_long, max_range_m / length, 1.0)
-    return Beams(ends * scale[:, None], is_return & ~too_long)
+    return Beams(beams.ends * scale[:, None], beams.is_return & ~too_long)
 
 
 def label_beams(
@@ -81,6 +91,6 @@ def beam_weights(labelled: LabelledPoints) -> Float64:
 
     A beam's hit and its free space then weigh the same, however many free points are drawn, and a fit needs no bias term.
     """
-    free = ~labelled.occupied
-    per_beam = np.bincount(labelled.beam[free], minlength=int(labelled.beam.max(initial=-1)) + 1)
-    return np.where(labelled.occupied, 1.0, 1.0 / np.maximum(per_beam[labelled.beam], 1))
+    n_beams = int(labelled.beam.max(initial=-1)) + 1
+    share = 1.0 / np.maximum(np.bincount(labelled.beam[~labelled.occupied], minlength=n_beams), 1)
+    return np.where(labelled.occupied, 1.0, share[labelled.beam])

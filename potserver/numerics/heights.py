@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from potserver.numerics.arrays import Bool, Float64, Int64
+from potserver.numerics.geometry import voxel_pick
 
 HEIGHTS_M = (-2.0, -0.6, -0.3, -0.12, 0.0, 0.12, 0.3, 0.6, 1.0, 1.6, 2.4, 3.5, 5.0, 8.0)
 RANGES_M = (0.0, 4.0, 8.0, 14.0, 22.0)
@@ -102,11 +103,8 @@ def ground_of(hits: Float64) -> Ground:
     Args:
         hits: (N, 3) m, N > 0, the sensor as origin, z up.
     """
-    cell = np.floor(hits[:, :2] / _CELL_M).astype(np.int64)
-    order = np.lexsort((hits[:, 2], cell[:, 0], cell[:, 1]))
-    is_first = np.ones(len(order), bool)
-    is_first[1:] = (np.diff(cell[order], axis=0) != 0).any(axis=1)
-    lowest = hits[order[is_first]]
+    upwards = hits[np.argsort(hits[:, 2], kind="stable")]
+    lowest = upwards[voxel_pick(upwards * (1.0, 1.0, 0.0), _CELL_M)]
     z, A = lowest[:, 2], np.column_stack([np.ones(len(lowest)), lowest[:, :2]])
     slack = len(lowest) * _FLAT_M**2 * 100.0
     ridge = np.diag([1e-6, slack, slack])

@@ -12,6 +12,10 @@ from concurrent.futures import ThreadPoolExecutor, wait
 from functools import cache
 from typing import TypeVar
 
+from threadpoolctl import threadpool_limits
+
+from potserver.thread_names import show_name
+
 T = TypeVar("T")
 R = TypeVar("R")
 
@@ -21,9 +25,18 @@ def default_threads() -> int:
     return max(1, len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1)
 
 
+def use_one_blas_thread() -> None:
+    """Let numpy's linear algebra stay on the thread that asks for it, in all of this process; for programs only.
+
+    Its products are too small here to be shared out, and its threads wait for the next one by spinning: a tenth of what a
+    server needed. Sums would also depend on the number of processors.
+    """
+    threadpool_limits(1, user_api="blas")
+
+
 @cache
 def _pool(threads: int, lane: str) -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(threads, thread_name_prefix=f"numerics-{lane}")
+    return ThreadPoolExecutor(threads, thread_name_prefix=f"numerics-{lane}", initializer=show_name)
 
 
 def parallel_map(function: Callable[[T], R], items: Iterable[T], threads: int, lane: str = "map") -> list[R]:

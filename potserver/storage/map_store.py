@@ -50,6 +50,7 @@ from potserver.storage.journal import Journal
 from potserver.storage.map_file import MapFile, Origin, SavedMap, read_map, write_map
 from potserver.storage.mark import Mark, Progress, read_mark
 from potserver.storage.sqlite import log_of
+from potserver.thread_names import show_name
 from potserver.threads import spawn
 
 log = get_logger("potserver.store")
@@ -141,7 +142,9 @@ class MapStore:
         self._writing = threading.Lock()  # one snapshot at a time
         self._wanted = self._closed = False
         self._thread = spawn(f"{map_id}-snapshots", self._run)
-        self._stager = concurrent.futures.ThreadPoolExecutor(1, thread_name_prefix=f"{map_id}-journal")
+        self._stager = concurrent.futures.ThreadPoolExecutor(
+            1, thread_name_prefix=f"{map_id}-journal", initializer=show_name
+        )
 
     # --- start ----------------------------------------------------------------------------------------------
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 import threading
 
 import pytest
@@ -44,3 +46,20 @@ def test_items_run_at_the_same_time() -> None:
 
 def test_there_is_at_least_one_thread() -> None:
     assert default_threads() >= 1
+
+
+ONE_THREAD = """
+import numpy as np
+from threadpoolctl import threadpool_info
+from potserver.numerics.threads import use_one_blas_thread
+use_one_blas_thread()
+np.ones((300, 300)) @ np.ones((300, 300))
+print(*(pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"))
+"""
+
+
+def test_linear_algebra_of_a_program_stays_on_one_thread() -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", ONE_THREAD], capture_output=True, text=True, timeout=120, check=True
+    )
+    assert set(done.stdout.split()) == {"1"}
