@@ -149,6 +149,12 @@ class MapFullError(MapServerError):
     code = "map_full"
 
 
+class MapDamagedError(MapServerError):
+    """The server's disk cannot read back a part of the map; its restart reads what was acknowledged."""
+
+    code = "map_damaged"
+
+
 class OldStampError(MapServerError):
     """The stamp is not newer than the last accepted cloud of this robot."""
 

@@ -2,8 +2,9 @@
 
 They are written to a file without a name and mapped into memory: whoever reads them finds the very same numbers, and the
 system brings them in from the disk and takes their memory back as it needs to. So scans and questions know nothing of pages.
-The file ends with the process; nothing is ever read from it at a start. A disk that cannot read a page back ends the process,
-as a failing swap does; what was acknowledged is in the journal and the snapshot then.
+The file ends with the process; nothing is ever read from it at a start. Where the disk cannot read a page back the file says so
+(`PageFile.check`), after which nothing that was computed from it may be used: what was acknowledged is in the journal and the
+snapshot.
 """
 
 from __future__ import annotations
@@ -22,7 +23,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potserver.domain.map_part import MapPart
+from potserver.domain.mapped import MappedFile
 from potserver.domain.tiles import Tile, TiledMap, TileIndex, part_of, tiles_of_part
+from potserver.errors import MapDamagedError
 
 _PAGE = mmap.ALLOCATIONGRANULARITY
 _SEGMENT_BYTES = 256 * 2**20  # of the file are mapped at once; what was not written takes no room
@@ -49,7 +52,7 @@ class PageFile:
         """Use a folder; the file is made when it is needed first."""
         self._folder = folder
         self._fd = -1
-        self._segments: list[tuple[int, mmap.mmap]] = []  # where each starts
+        self._segments: list[tuple[int, MappedFile]] = []  # where each starts
         self._end = 0  # of the file
         self._free: list[_Run] = []  # by place, none beside another
         self._dropped: collections.deque[_Run] = collections.deque()
@@ -73,13 +76,26 @@ class PageFile:
             self._dropped.append(run)
             raise
         start, segment = next(s for s in reversed(self._segments) if s[0] <= run.start)
-        extent = _Extent((run.n_bytes,), np.uint8, segment, run.start - start)
+        extent = _Extent((run.n_bytes,), np.uint8, segment.buffer, run.start - start)
         weakref.finalize(extent, self._dropped.append, run).atexit = False
         moved: dict[int, NDArray[Any]] = {}
         for array, at in zip(arrays, starts, strict=False):
             moved[id(array)] = np.ndarray(array.shape, array.dtype, extent, at)
             moved[id(array)].flags.writeable = array.flags.writeable
         return moved
+
+    def check(self) -> None:
+        """To be asked when something was computed from arrays here; from any thread.
+
+        Raises:
+            MapDamagedError: the disk could not read all of them back, and never will.
+        """
+        cut_off = self._fd >= 0 and os.fstat(self._fd).st_size < self._end
+        if cut_off or any(segment.is_lost for _, segment in self._segments):
+            raise MapDamagedError(
+                "the disk cannot read back a part of the map that lay on pages. All that was acknowledged is in the store:"
+                " restart the server to read it, and look at the disk"
+            )
 
     @property
     def n_bytes(self) -> int:
@@ -129,7 +145,7 @@ class PageFile:
             self._fd, name = tempfile.mkstemp(dir=self._folder, prefix="pages-")
             Path(name).unlink()  # a kill leaves nothing behind, and nobody can cut it off under us
         os.ftruncate(self._fd, self._end + n_bytes)
-        self._segments.append((self._end, mmap.mmap(self._fd, n_bytes, offset=self._end)))
+        self._segments.append((self._end, MappedFile(self._fd, n_bytes, self._end)))
         self._free.append(_Run(self._end, n_bytes))
         self._end += n_bytes
 

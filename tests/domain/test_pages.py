@@ -3,6 +3,11 @@
 from __future__ import annotations
 
 import gc
+import mmap
+import os
+import signal
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +16,7 @@ import pytest
 from potserver.domain.pages import PageFile, Pages
 from potserver.domain.tiles import TiledMap, part_of
 from potserver.domain.types import Scan, yaw_pose
+from potserver.errors import MapDamagedError
 from potserver.mapping.service import MappingService
 from potserver.mapping.settings import MappingSettings
 from potserver.storage.tile_codec import encode_tile
@@ -110,6 +116,49 @@ def test_the_coldest_parts_leave_memory_first(tmp_path: Path) -> None:
     mapper.relieve(pages)
     assert pages._resident == {}
     assert before <= pages.file.n_bytes < 1.5 * before
+
+
+def test_what_the_disk_does_not_read_back_is_told(tmp_path: Path) -> None:
+    file, other = PageFile(tmp_path), PageFile(tmp_path)
+    array = np.ones(100_000)
+    (paged,), (sound,) = (list(f.put([array]).values()) for f in (file, other))
+    file.check()
+    os.ftruncate(file._fd, 2 * mmap.PAGESIZE)  # as unreadable as a sector that has gone bad
+    with pytest.raises(MapDamagedError, match="restart the server"):  # before anybody meets it
+        file.check()
+    os.ftruncate(file._fd, file._end)
+    file.check()
+    os.ftruncate(file._fd, 2 * mmap.PAGESIZE)
+    assert paged.sum() == 2 * mmap.PAGESIZE / 8, "zeros, and the process lives"
+    os.ftruncate(file._fd, file._end)
+    with pytest.raises(MapDamagedError, match="restart the server"):
+        file.check()
+    file.close()
+    with pytest.raises(MapDamagedError, match="restart the server"):
+        file.check()
+    other.check()
+    assert sound.sum() == len(array)
+
+
+def test_a_bus_error_elsewhere_is_not_ours(tmp_path: Path) -> None:
+    """Neither before nor after one that is."""
+    code = f"""
+import mmap, os, sys
+from pathlib import Path
+import numpy as np
+from potserver.domain.pages import PageFile
+file = PageFile(Path({str(tmp_path)!r}))
+(paged,) = file.put([np.ones(100_000)]).values()
+os.ftruncate(file._fd, 0)
+print(paged.sum(), flush=True)
+with open({str(tmp_path / "foreign")!r}, "w+b") as foreign:
+    foreign.truncate(mmap.PAGESIZE)
+    mapped = mmap.mmap(foreign.fileno(), mmap.PAGESIZE)
+    foreign.truncate(0)
+    mapped[0]
+"""
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+    assert (run.stdout, run.returncode) == ("0.0\n", -signal.SIGBUS), run.stderr
 
 
 def test_a_disk_that_refuses_leaves_the_map_in_memory(tmp_path: Path) -> None:
