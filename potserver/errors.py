@@ -133,6 +133,13 @@ class OverloadedError(PotserverError):
     retryable = True
 
 
+class TooManyError(PotserverError):
+    """This client asks faster than one may; try again after `retry_after_s`."""
+
+    code = "too_many"
+    retryable = True
+
+
 class DeadlineError(PotserverError):
     """The asker's deadline passed before the work was done."""
 

@@ -236,6 +236,7 @@ class MapServer:
             threads=s.queries.threads,
             max_queued=s.queries.max_queued,
             max_queued_bytes=QUEUE_MESSAGES * s.limits.max_query_bytes,
+            max_rate_hz=s.queries.max_rate_hz,
         )
         self._sessions = SessionWatch(session, self.pool.give_up, self._max_sessions)
         shared = Shared(s, session, self.pool, _atom_store(mappers, s), self.health)

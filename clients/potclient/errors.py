@@ -204,6 +204,13 @@ class OverloadedError(MapServerError):
     retryable = True
 
 
+class TooManyError(MapServerError):
+    """This client asks faster than one may; try again after `retry_after_s`, with more in a question."""
+
+    code = "too_many"
+    retryable = True
+
+
 class DeadlineError(MapServerError):
     """The deadline passed before the server could start."""
 

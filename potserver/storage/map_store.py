@@ -305,6 +305,8 @@ class MapStore:
             StorageError: the disk refuses; what was kept before still is, and the state must not become the map.
             MapDamagedError: likewise, see `check_readable`.
         """
+        if state.tiled is not None:
+            self._pages.verify(state.tiled)
         with self._writing:
             newest = _Newest(state, heard, self._number)
             self._write(newest)

@@ -658,6 +658,7 @@ class ErrorCode(str, Enum):
     READ_ONLY = "read_only"  # the server takes no changes of its dictionary, or of anything
     UNSUPPORTED = "unsupported"  # no such operation or verb
     OVERLOADED = "overloaded"  # the queue is full; retry after retry_after_s
+    TOO_MANY = "too_many"  # this client asks faster than one may; retry after retry_after_s
     DEADLINE = "deadline"  # the deadline passed before the work could start
     SHUTTING_DOWN = "shutting_down"  # the server takes no more work
     STORAGE = "storage"  # the server's disk did not take it; nothing was changed

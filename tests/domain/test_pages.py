@@ -140,6 +140,56 @@ def test_what_the_disk_does_not_read_back_is_told(tmp_path: Path) -> None:
     assert sound.sum() == len(array)
 
 
+def flip(file: PageFile, place: int) -> None:
+    (byte,) = os.pread(file._fd, 1, place)
+    os.pwrite(file._fd, bytes([byte ^ 1 << place % 8]), place)
+
+
+def test_a_bit_that_flips_anywhere_is_found_when_the_turn_comes(tmp_path: Path) -> None:
+    file = PageFile(tmp_path)
+    kept = [file.put([np.random.default_rng(i).normal(size=900)]) for i in range(3)]
+    end = file.n_bytes
+    for place in range(0, end, 64):
+        flip(file, place)
+        for _ in kept:
+            file.scrub()
+        with pytest.raises(MapDamagedError):
+            file.check()
+        flip(file, place)
+        file._is_damaged = False
+    for _ in kept:
+        file.scrub()
+    file.check()
+
+
+def test_a_scan_on_damaged_pages_is_kept_nowhere(tmp_path: Path) -> None:
+    mapper, pages = MappingService(settings=SETTINGS, threads=1), Pages(tmp_path, 1)
+    for seq, x_m in enumerate((0.0, 120.0, 240.0)):
+        mapper.integrate(scan_at(x_m, seq))
+        mapper.relieve(pages)
+    before = mapper.state.tiled
+    assert before is not None
+    end = pages.file.n_bytes
+    mapper.integrate(scan_at(1.0, 3))
+    assert mapper.state.tiled is not None
+    pages.verify(mapper.state.tiled)
+    pages.file.check()
+    n_found = 0
+    for place in range(0, end, 4096):
+        flip(pages.file, place)
+        pages.verify(mapper.state.tiled)
+        n_found += pages.file._is_damaged
+        flip(pages.file, place)
+        pages.file._is_damaged = False
+    changed = {id(part) for part in before.parts.values()} - {
+        id(part) for part in mapper.state.tiled.parts.values()
+    }
+    assert 0 < len(changed) < len(before.parts)
+    assert 0.1 < n_found / (end / 4096) < 0.6, (
+        "of the room that was seen again; of the others nothing was taken"
+    )
+
+
 def test_a_bus_error_elsewhere_is_not_ours(tmp_path: Path) -> None:
     """Neither before nor after one that is."""
     code = f"""
