@@ -1,17 +1,19 @@
 """Tortures a server and its store, and prints what became of it: nothing acknowledged may be lost, and nothing may go unsaid.
 
     make torture                                                  minutes
-    make torture ARGS='--night'                                   a night: every call, 400 pieces, a million messages, 100
-                                                                  kills, 500 sessions, an hour of a fleet
+    make torture ARGS='--night'                                   a night: every call, every 64 bytes, a million messages,
+                                                                  100 kills, 500 sessions, an hour of a fleet
+    make torture ARGS='--parts files kills'                       these only
 
 1. Calls: the process of a store is killed before, or in the middle of, every write, fsync, truncate, rename and unlink, or
    the disk refuses that call, or it and all that follow, or the power fails. A C compiler is needed: the calls are caught by
    a preloaded library.
-2. Files: in every piece of every file of a store a bit flips, a sector is cleared, or the file ends. And a running store is
-   copied, file by file.
+2. Files: in every run of bytes of every file that a server reads a bit flips, a sector is cleared, or the file ends; in the
+   pages of a map that is served too. And a running store is copied, file by file.
 3. Messages: hostile ones, over Zenoh.
 4. Kills: SIGKILL of a server under load (`kill.py`).
 5. Sessions that come and go (`sessions.py`), and 50 robots with 200 planners (`fleet.py`).
+6. A short question beside eight askers of grids, while most of that goes on (`fairness.py`).
 """
 
 from __future__ import annotations
@@ -25,12 +27,14 @@ import sys
 import tempfile
 import time
 from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
 
-from benchmarks import fleet, kill
+from benchmarks import fairness, fleet, kill
 from benchmarks import sessions as sessions_benchmark
+from benchmarks.torture_damage import torture_copies, torture_files, torture_pages
 from benchmarks.torture_messages import torture_messages
-from benchmarks.torture_store import Outcomes, build_shim, torture_copies, torture_files
+from benchmarks.torture_store import Outcomes, build_shim
 
 _GROWTH_MB = 64  # of a server's memory that is no leak: compiled code, queues
 
@@ -84,6 +88,14 @@ def run_fleet(seconds: float) -> Outcomes:
     return Outcomes(f"50 robots, 200 planners, {seconds:g} s, {rest}", counts, list(found["wrong"]))
 
 
+def run_short_questions(seconds: float) -> Outcomes:
+    """Part 6: none may fail; how long they take depends on what else the machine does, so that is printed only."""
+    found = fairness.measure(8, seconds, scans=8, faults=fairness.FAULTS)
+    points = found["points of 100"]
+    name = f"100 points beside 8 askers of grids and all faults, ms p50 p95 p99 longest {points['ms p50 p95 p99 max']}"
+    return Outcomes(name, Counter({"answered": points["answered"]}), points["failed"])
+
+
 def told(title: str, outcomes: list[Outcomes], begun_s: float) -> int:
     """Print a table; returns how many went wrong."""
     print(f"\n{title} ({time.monotonic() - begun_s:.0f} s)")
@@ -101,35 +113,49 @@ def main() -> int:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--every", type=int, default=2, metavar="N", help="part 1: every Nth call [2]")
-    parser.add_argument("--pieces", type=int, default=40, help="part 2: of each file [40]")
+    parser.add_argument(
+        "--run-bytes", type=int, default=2048, metavar="N", help="part 2: of each file [2048]"
+    )
     parser.add_argument("--messages", type=int, default=20_000, help="part 3 [20000]")
     parser.add_argument("--kills", type=int, default=5, help="part 4 [5]")
     parser.add_argument("--sessions", type=int, default=10, help="part 5 [10]")
-    parser.add_argument("--fleet-s", type=float, default=20.0, help="part 5, seconds [20]")
+    parser.add_argument("--fleet-s", type=float, default=20.0, help="part 5 and 6, seconds [20]")
     parser.add_argument("--seed", type=int, default=0, help="of parts 2 to 4 [0]")
+    parser.add_argument("--parts", nargs="+", choices=_PARTS, default=list(_PARTS), help="only these")
     parser.add_argument("--night", action="store_true", help="the length of a night, whatever else is said")
     options = parser.parse_args()
     if options.night:
-        vars(options).update(every=1, pieces=400, messages=1_000_000, kills=100, sessions=500, fleet_s=3600.0)
+        night = {
+            "every": 1,
+            "run_bytes": 64,
+            "messages": 1_000_000,
+            "kills": 100,
+            "sessions": 500,
+            "fleet_s": 3600.0,
+        }
+        vars(options).update(night)
     logging.disable(logging.CRITICAL)  # refusals are what is wanted here
-
-    def show(line: str) -> None:
-        print(f"\r{line:<100}", end="", file=sys.stderr, flush=True)
-
-    wrong, begun_s = 0, time.monotonic()
-    wrong += told("faults of calls", run_calls(options.every), begun_s)
-    begun_s = time.monotonic()
-    wrong += told(
-        "damage of files", [*torture_files(options.pieces, options.seed, show), torture_copies(show)], begun_s
-    )
-    begun_s = time.monotonic()
-    wrong += told("messages", torture_messages(options.messages, options.seed, show), begun_s)
-    begun_s = time.monotonic()
-    wrong += told("kills", [run_kills(options.kills, options.seed)], begun_s)
-    begun_s = time.monotonic()
-    wrong += told("sessions", [run_sessions(options.sessions), run_fleet(options.fleet_s)], begun_s)
+    wrong = 0
+    for name in options.parts:
+        begun_s = time.monotonic()
+        wrong += told(name, _PARTS[name](options), begun_s)
     print(f"\n{wrong} wrong")
     return 1 if wrong else 0
+
+
+def _show(line: str) -> None:
+    print(f"\r{line:<100}", end="", file=sys.stderr, flush=True)
+
+
+_PARTS: dict[str, Callable[[argparse.Namespace], list[Outcomes]]] = {
+    "calls": lambda o: run_calls(o.every),
+    "files": lambda o: torture_files(o.run_bytes, o.seed, _show),
+    "pages": lambda o: [torture_pages(o.run_bytes, o.seed, _show), torture_copies(_show)],
+    "messages": lambda o: torture_messages(o.messages, o.seed, _show),
+    "kills": lambda o: [run_kills(o.kills, o.seed)],
+    "sessions": lambda o: [run_sessions(o.sessions), run_fleet(o.fleet_s)],
+    "questions": lambda o: [run_short_questions(o.fleet_s)],
+}
 
 
 if __name__ == "__main__":

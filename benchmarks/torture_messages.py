@@ -20,10 +20,15 @@ from potschemas.examples import examples
 from potserver.config import load_settings
 from potserver.server import MapServer
 
-_OPS = ("points", "grid", "rays", "risk", "params", "tiles", "atoms", "info")
+OPS = ("points", "grid", "rays", "risk", "params", "tiles", "atoms", "info")
 _ANSWER_S = 30.0
 _ROBOT = "mallory"
-_SETTINGS = {"mapping.max_range_m": 15.0, "mapping.beams_per_scan": 100, "mapping.tile_size_m": 10.0}
+_SETTINGS = {
+    "mapping.max_range_m": 15.0,
+    "mapping.beams_per_scan": 100,
+    "mapping.tile_size_m": 10.0,
+    "queries.max_rate_hz": 1e6,
+}
 
 
 def torture_messages(n: int, seed: int, show: Callable[[str], None]) -> list[Outcomes]:
@@ -35,7 +40,7 @@ def torture_messages(n: int, seed: int, show: Callable[[str], None]) -> list[Out
     with (
         MapServer(load_settings(overrides=_SETTINGS), listen="tcp/127.0.0.1:0") as server,
         MapClient(server.endpoint) as client,
-        zenoh.open(_config(server.endpoint)) as session,
+        zenoh.open(config_of(server.endpoint)) as session,
     ):
         map_keys = keys.MapKeys(keys.DEFAULT_ROOT, "default")
         told: queue.Queue[messages.Receipt] = queue.Queue()
@@ -44,7 +49,7 @@ def torture_messages(n: int, seed: int, show: Callable[[str], None]) -> list[Out
         client.integrate(points, np.eye(4), robot="r1")
         for i in range(n):
             if i % 3:
-                op = rng.choice(_OPS)
+                op = rng.choice(OPS)
                 fitting = [wire.encode(m) for m in examples().values() if m.schema == f"pot.{op}_query.v1"]
                 payload = mutated(rng.choice(fitting if rng.random() < 0.8 else golden), golden, rng)
                 _note(queries, _asked(session, map_keys.query(op), payload), f"{op}: {payload[:60]!r}")
@@ -108,7 +113,8 @@ def _receipt(sample: zenoh.Sample) -> messages.Receipt:
     return wire.decode(sample.payload.to_bytes(), messages.Receipt)
 
 
-def _config(endpoint: str) -> zenoh.Config:
+def config_of(endpoint: str) -> zenoh.Config:
+    """Of a client's session."""
     config: zenoh.Config = zenoh.Config()
     config.insert_json5("mode", '"client"')
     config.insert_json5("connect/endpoints", f'["{endpoint}"]')

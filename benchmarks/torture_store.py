@@ -1,4 +1,4 @@
-"""A store under faults: its process is stopped, or its disk refuses, at every single write; and bits of its files flip.
+"""A store under faults: its process is stopped, or its disk refuses, at every single write.
 
 Every child process runs the same steps on a store of its own and tells which were acknowledged. What the store then holds
 must be what a map without faults holds after just those steps; the step in work at the end may be in it or not.
@@ -11,7 +11,6 @@ import dataclasses
 import errno
 import functools
 import hashlib
-import itertools
 import json
 import os
 import random
@@ -21,7 +20,7 @@ import subprocess
 import sys
 import tempfile
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from enum import IntEnum
 from pathlib import Path
 
@@ -35,14 +34,13 @@ from potserver.errors import PotserverError
 from potserver.health import Health
 from potserver.mapping.service import MappingService
 from potserver.mapping.settings import MappingSettings
-from potserver.storage.map_file import read_map
 from potserver.storage.map_store import MapStore
 from potserver.storage.tile_codec import encode_tile
 
 SOURCE = Path(__file__).with_name("faults.c")
-_SETTINGS = MappingSettings(max_range_m=15.0, beams_per_scan=100)
+SETTINGS = MappingSettings(max_range_m=15.0, beams_per_scan=100)
 _SNAPSHOT_SCANS = 3  # few: faults meet snapshots
-_KEPT = "kept"
+KEPT = "kept"
 _PAGE = 4096  # bytes that a disk writes at once
 # t: a scan; s: a snapshot; k: a saved map; c: clear; l: load what was saved
 STEPS = "ttskttcttlt"
@@ -89,7 +87,7 @@ class Driven:
     """A map and its store, driven as a server's writer does."""
 
     def __init__(self, folder: Path) -> None:
-        self.mapper, self.order = MappingService(settings=_SETTINGS, threads=1), CloudOrder()
+        self.mapper, self.order = MappingService(settings=SETTINGS, threads=1), CloudOrder()
         self.store = MapStore(
             folder,
             "default",
@@ -119,17 +117,17 @@ class Driven:
             self.mapper.clear(commit=lambda state: self.store.replace(state, {}))
             self.order.replace({})
         elif kind == "l":
-            state, heard = self.store.load(_KEPT, self.mapper)
+            state, heard = self.store.load(KEPT, self.mapper)
             self.mapper.restore(state, commit=lambda new: self.store.replace(new, heard))
             self.order.replace(heard)
         else:
-            self.store.save(_KEPT if kind == "k" else None, self.mapper, self.order.heard)
+            self.store.save(KEPT if kind == "k" else None, self.mapper, self.order.heard)
 
 
 @functools.cache
 def wanted(steps: tuple[int, ...]) -> str:
     """Digest of the map after just these steps, without a store and without faults."""
-    mapper = MappingService(settings=_SETTINGS, threads=1)
+    mapper = MappingService(settings=SETTINGS, threads=1)
     kept = mapper.state
     for number in steps:
         kind = STEPS[number]
@@ -256,7 +254,7 @@ def _judged(told: str, folder: Path, what: str, wrong: list[str]) -> str:
     refused = [int(word[1:]) for word in words if word[0] == "-"]
     began = int(words[-1][1:]) if words and words[-1][0] == "?" else None  # in work when it ended
     maybe = [*refused, *([] if began is None else [began])]
-    found = _in_child(lambda: _reopened(folder))
+    found = _in_child(lambda: reopened(folder))
     allowed = {wanted(done): "all acknowledged, nothing else"}
     for extra in maybe:  # what was not acknowledged may be there or not
         allowed.setdefault(wanted(tuple(sorted((*done, extra)))), "all acknowledged, and a step that was not")
@@ -284,7 +282,8 @@ def _run(shim: ctypes.CDLL, folder: Path, fault: Fault, at: int) -> str:
     return ""
 
 
-def _reopened(folder: Path) -> str:
+def reopened(folder: Path) -> str:
+    """Digest of the map that a store holds, or how it was refused."""
     try:
         driven = Driven(folder)
     except PotserverError as error:
@@ -318,109 +317,6 @@ def _in_child(work: Callable[[], str], *, partial: bool = False) -> str:
     if not partial and status:
         return f"ended with status {status}"
     return told
-
-
-# --- damage of files --------------------------------------------------------------------------------------------------
-
-
-def torture_files(pieces: int, seed: int, show: Callable[[str], None]) -> list[Outcomes]:
-    """Damage every one of `pieces` equal pieces of every file of a store: flip a bit, clear a sector, cut the file off."""
-    rng = random.Random(seed)
-    outcomes = []
-    with tempfile.TemporaryDirectory() as scratch:
-        for state, store in _stores(Path(scratch)):
-            files = sorted(path for path in store.rglob("*") if path.is_file() and path.stat().st_size)
-            for file in (path for path in files if not path.name.endswith("-shm")):
-                look = _read_saved if file.suffix == ".map" else _reopened
-                sound = look(shutil.copytree(store, Path(scratch) / f"sound-{state}-{file.name}"))
-                outcome = Outcomes(f"{file.name} ({state})")
-                for piece, kind in itertools.product(range(pieces), ("flip", "clear", "cut")):
-                    copy = shutil.copytree(store, Path(scratch) / "damaged")
-                    _damage(copy / file.relative_to(store), kind, piece, pieces, rng)
-                    found = look(copy)
-                    refused = found.startswith("refused")
-                    outcome.counts[
-                        "refused" if refused else "the same map" if found == sound else "wrong"
-                    ] += 1
-                    if not refused and found != sound:
-                        outcome.wrong.append(f"{outcome.name}: {kind} in piece {piece} of {pieces}: {found}")
-                    shutil.rmtree(copy)
-                show(f"{outcome.name}: {dict(outcome.counts)}")
-                outcomes.append(outcome)
-    return outcomes
-
-
-def torture_copies(show: Callable[[str], None]) -> Outcomes:
-    """Copy a store file by file while it is written, a step between any two files: it holds all that was acknowledged, or is
-    refused."""
-    outcome = Outcomes("copies of a running store")
-    with tempfile.TemporaryDirectory() as scratch:
-        for begun, is_reversed in itertools.product(range(1, len(STEPS)), (False, True)):
-            folder, copy = (
-                Path(scratch) / f"{begun}-{is_reversed}",
-                Path(scratch) / f"copy-{begun}-{is_reversed}",
-            )
-            driven, steps = Driven(folder), iter(range(len(STEPS)))
-            for number in itertools.islice(steps, begun):
-                driven.do(number)
-            (copy / "default").mkdir(parents=True)
-            for file in sorted((folder / "default").iterdir(), reverse=is_reversed):
-                if not file.name.endswith("-shm"):
-                    shutil.copy(file, copy / "default")
-                    for number in itertools.islice(steps, 1):
-                        driven.do(number)
-            driven.store.close()
-            found = _reopened(copy)
-            sound = {wanted(tuple(range(n))) for n in range(begun, len(STEPS) + 1)}
-            word = (
-                "refused"
-                if found.startswith("refused")
-                else "all acknowledged"
-                if found in sound
-                else "wrong"
-            )
-            outcome.counts[word] += 1
-            if word == "wrong":
-                outcome.wrong.append(f"copied from step {begun} on, reversed {is_reversed}: {found}")
-            show(f"{outcome.name}: {dict(outcome.counts)}")
-    return outcome
-
-
-def _stores(scratch: Path) -> Iterator[tuple[str, Path]]:
-    """The same map as a kill leaves it, all in the logs, and after a clean end, all in the files."""
-    driven = Driven(scratch / "served")
-    for number in range(len(STEPS)):
-        driven.do(number)
-    shutil.copytree(scratch / "served", scratch / "killed")
-    driven.store.close()
-    yield "killed", scratch / "killed"
-    yield "ended", scratch / "served"
-
-
-def _read_saved(store: Path) -> str:
-    (file,) = (store / "saved").rglob("*.map")
-    try:
-        return digest(read_map(file).state())
-    except PotserverError as error:
-        return f"refused: {error}"
-    except Exception as error:
-        return f"crashed: {error!r}"
-
-
-def _damage(file: Path, kind: str, piece: int, pieces: int, rng: random.Random) -> None:
-    size = file.stat().st_size
-    start = piece * size // pieces
-    place = rng.randrange(start, max(start + 1, (piece + 1) * size // pieces))
-    if kind == "cut":
-        os.truncate(file, place)
-        return
-    content = bytearray(file.read_bytes())
-    if kind == "flip":
-        content[place] ^= 1 << rng.randrange(8)
-    else:
-        sector = slice(place // 512 * 512, place // 512 * 512 + 512)
-        content[sector] = bytes(len(content[sector]))
-    file.write_bytes(content)
 
 
 def main(arguments: Sequence[str]) -> int:

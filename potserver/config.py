@@ -53,6 +53,9 @@ class QuerySettings:
 
     threads: Annotated[int, "questions in work at once"] = 2
     max_queued: Annotated[int, "questions that may wait, all maps; one more is refused at once"] = 64
+    max_rate_hz: Annotated[
+        float, "questions a second of one client, on average over one; more are refused `too_many`"
+    ] = 500.0
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)

@@ -83,6 +83,13 @@ class MapFullError(PotserverError):
     code = "map_full"
 
 
+class MapDamagedError(PotserverError):
+    """The disk cannot read back a part of the map that lay on it; a restart reads what was acknowledged."""
+
+    code = "map_damaged"
+    retryable = True
+
+
 class NoPoseError(PotserverError):
     """The cloud has no pose, and the pose stream has none at its stamp."""
 
@@ -123,6 +130,13 @@ class OverloadedError(PotserverError):
     """The queue is full; try again after `retry_after_s`."""
 
     code = "overloaded"
+    retryable = True
+
+
+class TooManyError(PotserverError):
+    """This client asks faster than one may; try again after `retry_after_s`."""
+
+    code = "too_many"
     retryable = True
 
 

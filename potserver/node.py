@@ -111,14 +111,14 @@ class MapNode:
             health=health,
         )
         self.robots = RobotWatch(self._session, self._keys, health=health, max_robots=limits.max_robots)
-        self._declarations = [self.robots, *self._declare(poses, writer, keeper.durable, shared)]
+        self._declarations = [self.robots, *self._declare(poses, writer, keeper, shared)]
         self._threads = [
             spawn(f"{self.map_id}-writer", writer.run),
             *(spawn(f"{self.map_id}-{type(d).__name__}", d.run) for d in self._declarations),
         ]
 
     def _declare(
-        self, poses: PoseBuffer, writer: MapWriter, durable: bool, shared: Shared
+        self, poses: PoseBuffer, writer: MapWriter, keeper: Keeper, shared: Shared
     ) -> list[_Declaration]:
         """The ways in, for poses, clouds, questions and control."""
         settings, limits, health = shared.settings, shared.settings.limits, shared.health
@@ -133,7 +133,8 @@ class MapNode:
             health=health,
             audit=Audit(self.map_id),
             limits=limits,
-            durable=durable,
+            durable=keeper.durable,
+            check_readable=keeper.check_readable,
         )
         answers = Answers(served, shared.pool)
         return [

@@ -36,6 +36,7 @@ from potserver.compiling import warm_up
 from potserver.config import Settings, as_tree
 from potserver.domain.dictionary import AtomDictionary
 from potserver.domain.order import Heard
+from potserver.errors import MapDamagedError
 from potserver.health import Health
 from potserver.log import get_logger
 from potserver.mapping.service import MappingService
@@ -160,9 +161,15 @@ class MapServer:
 
     @property
     def state(self) -> str:
-        """`starting`, `serving`, or `draining` when no map takes clouds any more."""
+        """`starting`, `serving`, `damaged` when the disk cannot read back a part of a map, or `draining` when no map takes
+        clouds any more."""
         if not self.nodes and not self._stopping.is_set():
             return "starting"
+        try:
+            for store in list(self._stores.values()):
+                store.check_readable()
+        except MapDamagedError:
+            return "damaged"
         serving = any(node.intake.is_admitting for node in self.nodes.values())
         return "serving" if serving and not self._stopping.is_set() else "draining"
 
@@ -229,6 +236,7 @@ class MapServer:
             threads=s.queries.threads,
             max_queued=s.queries.max_queued,
             max_queued_bytes=QUEUE_MESSAGES * s.limits.max_query_bytes,
+            max_rate_hz=s.queries.max_rate_hz,
         )
         self._sessions = SessionWatch(session, self.pool.give_up, self._max_sessions)
         shared = Shared(s, session, self.pool, _atom_store(mappers, s), self.health)

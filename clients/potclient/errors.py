@@ -149,6 +149,12 @@ class MapFullError(MapServerError):
     code = "map_full"
 
 
+class MapDamagedError(MapServerError):
+    """The server's disk cannot read back a part of the map; its restart reads what was acknowledged."""
+
+    code = "map_damaged"
+
+
 class OldStampError(MapServerError):
     """The stamp is not newer than the last accepted cloud of this robot."""
 
@@ -195,6 +201,13 @@ class OverloadedError(MapServerError):
     """The server's queue is full; try again after `retry_after_s`."""
 
     code = "overloaded"
+    retryable = True
+
+
+class TooManyError(MapServerError):
+    """This client asks faster than one may; try again after `retry_after_s`, with more in a question."""
+
+    code = "too_many"
     retryable = True
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from potclient.arrays import Float64
 from potclient.client import MapClient
 from potclient.datasets.scans import RecordedScan, Recording
-from potclient.errors import OverloadedError, PotclientError, UsageError
+from potclient.errors import OverloadedError, PotclientError, TooManyError, UsageError
 from potclient.feed import FeedOptions
 from potclient.results import FeedCounts, Receipt
 from potclient.session import SessionOptions
@@ -287,7 +287,7 @@ def _ask(client: MapClient, points: Any, tally: _Tally) -> None:
     asked = time.monotonic()
     try:
         client.occupancy(points)
-    except OverloadedError:
+    except (OverloadedError, TooManyError):
         with tally.lock:
             tally.overloaded += 1
     except PotclientError as error:

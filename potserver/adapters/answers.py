@@ -10,7 +10,7 @@ import zenoh
 
 from potserver.adapters.query_pool import QueryJob, QueryPool
 from potserver.adapters.questions.question import Asked, Question, Served
-from potserver.adapters.replies import BUG, asker_of, check_query, payload_of, reply, reply_error
+from potserver.adapters.replies import asker_of, check_query, failure, payload_of, reply, reply_error
 from potserver.codec.base import decode, encode
 from potserver.errors import DeadlineError, PotserverError, ShuttingDownError
 from potserver.log import get_logger
@@ -76,6 +76,8 @@ class Answers:
         """Decode, answer, send, and end the query, as long as somebody waits for it; on worker threads."""
         try:
             for step in question.steps(*self._ask(query, question, arrived_s)):
+                if question.reads_tiles:
+                    self._served.check_readable()
                 if step.reply is not None:
                     wire = encode(step.reply)
                     reply(query, key, wire)
@@ -86,13 +88,14 @@ class Answers:
             )  # before the end, so that who has the answer sees it counted
             self._served.health.observe(question.op, (time.monotonic() - arrived_s) * 1e3)
             query.drop()
-        except PotserverError as error:  # expected: the asker gets a typed reply
-            self.refuse(query, error, name)
-        except Exception:  # a bug: the traceback stays here
-            if self._pool.is_closing:  # the pool has cut the query off
+        except Exception as error:  # the asker gets a typed reply; the traceback of a bug stays here
+            if self._pool.is_closing and not isinstance(
+                error, PotserverError
+            ):  # the pool has cut the query off
                 return
-            log.exception("query_failed", key=key)
-            self.refuse(query, PotserverError(BUG), name)
+            self.refuse(
+                query, failure(error, self._served.check_readable, log, "query_failed", key=key), name
+            )
 
     def _ask(self, query: zenoh.Query, question: Question[Any], arrived_s: float) -> tuple[Asked, Any]:
         max_bytes = question.max_bytes or self._served.limits.max_query_bytes

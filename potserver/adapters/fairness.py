@@ -1,10 +1,13 @@
-"""Who makes room in a full queue: the newest of whoever holds most of what is short."""
+"""Who makes room in a full queue: the newest of whoever holds most of what is short. And who asks too often."""
 
 from __future__ import annotations
 
+import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from typing import NamedTuple, Protocol, TypeVar
+
+from potserver.errors import TooManyError
 
 
 class Waiting(Protocol):
@@ -16,7 +19,41 @@ class Waiting(Protocol):
     def n_bytes(self) -> int: ...
 
 
+_BURST_S = 1.0
+_MOST_LANES = 4096  # that are remembered though they came long ago
+
 WaitingT = TypeVar("WaitingT", bound=Waiting)
+
+
+class Rates:
+    """How often each lane comes: on average over a second not more than it may. One caller at a time.
+
+    Args:
+        most_hz: Of one lane.
+        clock: Seconds.
+    """
+
+    def __init__(self, most_hz: float, clock: Callable[[], float] = time.monotonic) -> None:
+        self._most_hz, self._clock = most_hz, clock
+        self._due_s: dict[str, float] = {}  # when a lane would come next if it kept an even pace
+
+    def check(self, lane: str) -> None:
+        """Count one more.
+
+        Raises:
+            TooManyError: it comes too early, and is not counted.
+        """
+        now_s = self._clock()
+        due_s = max(self._due_s.get(lane, now_s), now_s) + 1.0 / self._most_hz
+        early_s = due_s - now_s - max(_BURST_S, 1.0 / self._most_hz)  # one is always taken
+        if early_s > 0.0:
+            raise TooManyError(
+                f"more than {self._most_hz:g} questions a second from this client (queries.max_rate_hz)",
+                retry_after_s=early_s,
+            )
+        self._due_s[lane] = due_s
+        if len(self._due_s) > _MOST_LANES:
+            self._due_s = {lane: due_s for lane, due_s in self._due_s.items() if due_s > now_s}
 
 
 class Bounds(NamedTuple):

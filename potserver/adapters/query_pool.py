@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import collections
 import dataclasses
+import math
 import threading
 import time
 from collections.abc import Callable, Iterator
 
-from potserver.adapters.fairness import Bounds, make_room
+from potserver.adapters.fairness import Bounds, Rates, make_room
 from potserver.errors import OverloadedError, PotserverError, ShuttingDownError
 from potserver.log import get_logger
 from potserver.threads import spawn
@@ -64,13 +65,21 @@ class QueryPool:
         threads: Workers that take everything.
         max_queued: Queries waiting; one more is refused at once.
         max_queued_bytes: Bytes of their payloads.
+        max_rate_hz: Queries a second of one asker; one that comes earlier is refused.
         retry_after_s: What a refused asker is advised to wait.
     """
 
     def __init__(
-        self, *, threads: int, max_queued: int, max_queued_bytes: int, retry_after_s: float = RETRY_AFTER_S
+        self,
+        *,
+        threads: int,
+        max_queued: int,
+        max_queued_bytes: int,
+        max_rate_hz: float = math.inf,
+        retry_after_s: float = RETRY_AFTER_S,
     ) -> None:
         self._bounds, self._retry_after_s = Bounds(max_queued, max_queued_bytes), retry_after_s
+        self._rates = Rates(max_rate_hz)
         self._changed = threading.Condition()
         self._askers: dict[str, _Asker] = {}
         self._closed = False
@@ -101,12 +110,13 @@ class QueryPool:
         """Queue a query; others that lose their place to it are refused.
 
         Raises:
-            OverloadedError: the queue is full.
+            OverloadedError: the queue is full. TooManyError: its asker asks too often.
             ShuttingDownError: the pool is closed.
         """
         with self._changed:
             if self._closed:
                 raise ShuttingDownError("the server is closing")
+            self._rates.check(job.asker)
             counts, sizes = self._counts(), self._sizes()
             error = OverloadedError(
                 f"{counts.total()} queries of {sizes.total()} bytes wait already, {counts[job.asker]} of them this client's",

@@ -3,14 +3,31 @@
 from __future__ import annotations
 
 import contextlib
+from collections.abc import Callable
+from typing import Any
 
 import zenoh
 
 from potschemas import messages
 from potserver.codec.base import Wire, check_encoding, check_size, encode_error
-from potserver.errors import PotserverError
+from potserver.errors import MapDamagedError, PotserverError
 
 BUG = "a bug of the server; the traceback is in its log"
+
+
+def failure(
+    error: Exception, check_readable: Callable[[], None], log: Any, event: str, **fields: object
+) -> PotserverError:
+    """What to tell of an exception in work: itself, or a bug, which is logged; or that the map was unreadable, where it was,
+    because then nothing means what it says."""
+    try:
+        check_readable()
+    except MapDamagedError as damage:
+        return damage
+    if isinstance(error, PotserverError):
+        return error
+    log.error(event, exc_info=error, **fields)
+    return PotserverError(BUG)
 
 
 def check_query(query: zenoh.Query, kind: type[messages.Message], max_bytes: int, what: str) -> int:

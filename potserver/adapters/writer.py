@@ -10,14 +10,14 @@ from potserver.adapters.clouds import CloudReader
 from potserver.adapters.intake import CloudJob, IntakeQueue
 from potserver.adapters.poses import WAIT_S, PoseNotYetError
 from potserver.adapters.receipts import ReceiptSender
-from potserver.adapters.replies import BUG
+from potserver.adapters.replies import failure
 from potserver.adapters.stamps import check_not_future
 from potserver.domain.map_size import MapSize
 from potserver.domain.map_state import MapState
 from potserver.domain.order import CloudOrder
 from potserver.domain.tiles import check_reach
 from potserver.domain.types import Float64, TileChange
-from potserver.errors import MapFullError, PotserverError
+from potserver.errors import MapFullError
 from potserver.health import Health
 from potserver.log import get_logger
 from potserver.mapping.service import MappingService
@@ -194,13 +194,12 @@ class MapWriter:
             wanted = self._receipts.wanted(job, scan)
             with self._keeper.keeping(scan) as commit:
                 update = self._mapper.integrate(scan, params=wanted, commit=commit)
-        except PotserverError as error:
+        except Exception as error:
             if not (isinstance(error, PoseNotYetError) and self._waits(job, error)):
-                self._receipts.refuse(job, error)
-            return
-        except Exception:
-            log.exception("scan_failed", map_id=self._map_id, robot_id=job.robot_id)
-            self._receipts.refuse(job, PotserverError(BUG))
+                told = {"map_id": self._map_id, "robot_id": job.robot_id}
+                self._receipts.refuse(
+                    job, failure(error, self._keeper.check_readable, log, "scan_failed", **told)
+                )
             return
         integrate_ms = (time.perf_counter() - started_s) * 1e3
         self._order.remember(scan.robot_id, scan.session, scan.seq)

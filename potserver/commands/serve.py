@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import contextlib
 import os
-import select
 import signal
 import stat
 import sys
@@ -128,8 +127,10 @@ class StopSignals:
 
     def __init__(self) -> None:
         self.name: str | None = None
-        # a pipe and not an Event: a handler may interrupt the very thread that holds the Event's lock
+        # The interpreter runs handlers between two of its steps, so a signal that comes just before a thread begins to wait, or
+        # to another thread, would be seen when the wait ends. What its C code writes into a pipe ends the wait.
         self._read_end, self._write_end = os.pipe()
+        os.set_blocking(self._write_end, False)
 
     @classmethod
     @contextlib.contextmanager
@@ -137,9 +138,11 @@ class StopSignals:
         """Handle the signals inside the block."""
         stop = cls()
         before = {number: signal.signal(number, stop._note) for number in (signal.SIGTERM, signal.SIGINT)}
+        woken_before = signal.set_wakeup_fd(stop._write_end, warn_on_full_buffer=False)
         try:
             yield stop
         finally:
+            signal.set_wakeup_fd(woken_before)
             for number, handler in before.items():
                 signal.signal(number, handler)
             os.close(stop._read_end)
@@ -148,11 +151,10 @@ class StopSignals:
     def wait(self) -> None:
         """Return once a signal has come."""
         while self.name is None:
-            select.select([self._read_end], [], [])
+            os.read(self._read_end, 1)  # a byte a signal
 
     def _note(self, number: int, _frame: FrameType | None) -> None:
         if self.name is not None:
             os.write(2, b"potserver: second signal, leaving at once\n")
             os._exit(EXIT_FORCED)
         self.name = signal.Signals(number).name
-        os.write(self._write_end, b".")

@@ -6,8 +6,9 @@
     float32   hit_points (H, 3), free_points (F, 3) and the kernels' arrays, of all atoms one after the other
     uint8     sha256 (32,): of every byte of the file before it
 
-Nothing in it is executed. The same atoms give the same bytes. The arrays are aligned, so that an open file is mapped and not
-read. Positions of kernels are float32 here, exact to 1 um in a sector, and widened to float64 when an atom is taken out.
+Nothing in it is executed. The same atoms give the same bytes. A file is read once and as a whole: what becomes of it later
+changes no atom. Positions of kernels are float32 here, exact to 1 um in a sector, and widened to float64 when an atom is taken
+out.
 """
 
 from __future__ import annotations
@@ -17,7 +18,6 @@ import hashlib
 import itertools
 import json
 import math
-import mmap
 import os
 from collections.abc import Sequence
 from pathlib import Path
@@ -58,7 +58,7 @@ class AtomRecord(NamedTuple):
 
 
 class AtomFile:
-    """An open file; lives as long as an atom of it."""
+    """What a file holds; lives as long as an atom of it."""
 
     def __init__(
         self,
@@ -70,7 +70,7 @@ class AtomFile:
         self.path, self.records, self.heights, self._arrays = path, records, heights, arrays
 
     def atom(self, number: int) -> Atom:
-        """One atom; all its arrays but the kernels' positions are read-only views of the mapped file.
+        """One atom; all its arrays but the kernels' positions are read-only views of its bytes.
 
         Raises:
             DictionaryError: its numbers are no atom's.
@@ -113,12 +113,9 @@ def write_atoms(path: Path, atoms: Sequence[Atom], heights: HeightModels | None 
         raise DictionaryError(f"cannot write {path}: {error.strerror or error}") from error
 
 
-def open_atoms(path: Path, *, verify: bool = True) -> AtomFile:
-    """Map a file.
+def open_atoms(path: Path) -> AtomFile:
+    """Read a file.
 
-    Args:
-        path: The file.
-        verify: Read all of it once and compare its SHA-256; false trusts the disk, and reads only what is used.
     Raises:
         DictionaryError: missing, truncated, damaged, of another format or of another version; the message says which.
     """
@@ -136,7 +133,8 @@ def open_atoms(path: Path, *, verify: bool = True) -> AtomFile:
                     (name, (part := container.get_slice(name)).get_dtype(), tuple(part.get_shape()))
                     for name in container.offset_keys()
                 ]
-            mapped = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
+            stream.seek(0)
+            content = stream.read()
     except FileNotFoundError:
         raise DictionaryError(f"no atom dictionary at {path}") from None
     except SafetensorError as error:
@@ -145,10 +143,10 @@ def open_atoms(path: Path, *, verify: bool = True) -> AtomFile:
         raise DictionaryError(f"cannot read {path}: {error.strerror or error}") from error
     if _METADATA_KEY not in metadata:
         raise DictionaryError(f"{path} is a safetensors file, but no atom dictionary")
-    if verify and hashlib.sha256(memoryview(mapped)[:-_DIGEST_BYTES]).digest() != mapped[-_DIGEST_BYTES:]:
+    if hashlib.sha256(memoryview(content)[:-_DIGEST_BYTES]).digest() != content[-_DIGEST_BYTES:]:
         raise DictionaryError(f"{path} is damaged: its SHA-256 does not fit its content")
     records, heights = _parse_metadata(path, metadata[_METADATA_KEY])
-    return AtomFile(path, records, heights, _map_arrays(path, mapped, described, len(records)))
+    return AtomFile(path, records, heights, _arrays_of(path, content, described, len(records)))
 
 
 def _image(atoms: Sequence[Atom], heights: HeightModels | None) -> bytes:
@@ -184,19 +182,19 @@ def _offsets(counts: list[int]) -> NDArray[np.int64]:
     return np.concatenate([[0], np.cumsum(counts)]).astype(np.dtype("<i8"))
 
 
-def _map_arrays(
-    path: Path, mapped: mmap.mmap, described: list[tuple[str, str, tuple[int, ...]]], n_atoms: int
+def _arrays_of(
+    path: Path, content: bytes, described: list[tuple[str, str, tuple[int, ...]]], n_atoms: int
 ) -> dict[str, NDArray[Any]]:
     """Read-only views; the container guarantees that the arrays lie one after the other and end with the file."""
     arrays: dict[str, NDArray[Any]] = {}
-    start = 8 + int.from_bytes(mapped[:8], "little")
+    start = 8 + int.from_bytes(content[:8], "little")
     for name, dtype_name, shape in described:
         if dtype_name not in _DTYPES:
             raise DictionaryError(f"{path}: array {name!r} is of type {dtype_name}")
         dtype = _DTYPES[dtype_name]
         size = math.prod(shape)
         arrays[name] = (
-            np.frombuffer(mapped, dtype, size, start).reshape(shape) if size else np.zeros(shape, dtype)
+            np.frombuffer(content, dtype, size, start).reshape(shape) if size else np.zeros(shape, dtype)
         )
         start += size * dtype.itemsize
     expected: dict[str, tuple[str, tuple[int, ...]]] = dict.fromkeys(_OFFSETS, ("I64", (n_atoms + 1,)))

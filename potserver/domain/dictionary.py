@@ -97,16 +97,13 @@ class AtomDictionary:
         write_atoms(Path(path), self.atoms, self.heights)
 
     @staticmethod
-    def load(path: str | os.PathLike[str], *, verify: bool = True) -> AtomDictionary:
-        """Open a file; it never executes anything. While its atoms are in use it may be replaced, but not overwritten.
+    def load(path: str | os.PathLike[str]) -> AtomDictionary:
+        """Read a file that `save` wrote; it never executes anything.
 
-        Args:
-            path: What `save` wrote.
-            verify: Read all of it once and compare its SHA-256; false trusts the disk, and reads only what is used.
         Raises:
             DictionaryError: missing, truncated, damaged, or of another format or version; the message says which.
         """
-        file = open_atoms(Path(path), verify=verify)
+        file = open_atoms(Path(path))
         return AtomDictionary._of(
             (_StoredAtom(file, number) for number in range(len(file.records))), file.heights
         )

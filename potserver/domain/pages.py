@@ -2,8 +2,10 @@
 
 They are written to a file without a name and mapped into memory: whoever reads them finds the very same numbers, and the
 system brings them in from the disk and takes their memory back as it needs to. So scans and questions know nothing of pages.
-The file ends with the process; nothing is ever read from it at a start. A disk that cannot read a page back ends the process,
-as a failing swap does; what was acknowledged is in the journal and the snapshot then.
+The file ends with the process; nothing is ever read from it at a start. Where the disk cannot read a page back, or reads other
+bits, the file says so (`PageFile.check`), after which nothing that was computed from it may be used: what was acknowledged is
+in the journal and the snapshot. What cannot be read is noticed at once. Other bits are found by a checksum of a run, compared
+before what was made of it is kept anywhere, and of one run after the other as scans come.
 """
 
 from __future__ import annotations
@@ -14,6 +16,7 @@ import mmap
 import os
 import tempfile
 import weakref
+import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -22,7 +25,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potserver.domain.map_part import MapPart
+from potserver.domain.mapped import MappedFile
 from potserver.domain.tiles import Tile, TiledMap, TileIndex, part_of, tiles_of_part
+from potserver.errors import MapDamagedError
 
 _PAGE = mmap.ALLOCATIONGRANULARITY
 _SEGMENT_BYTES = 256 * 2**20  # of the file are mapped at once; what was not written takes no room
@@ -35,6 +40,13 @@ _AT_ONCE = 8 * 2**20  # bytes below the limit that are aimed at: snapshots are i
 class _Extent(np.ndarray[Any, np.dtype[np.uint8]]):
     """A run of the file, mapped. A type of its own, so that arrays in it name it as their base and keep it alive: when the last
     one is gone its place is free."""
+
+    digest: int  # of what was written
+
+    @property
+    def is_sound(self) -> bool:
+        """What is read is what was written."""
+        return zlib.crc32(self.data) == self.digest
 
 
 class _Run(NamedTuple):
@@ -49,10 +61,14 @@ class PageFile:
         """Use a folder; the file is made when it is needed first."""
         self._folder = folder
         self._fd = -1
-        self._segments: list[tuple[int, mmap.mmap]] = []  # where each starts
+        self._segments: list[tuple[int, MappedFile]] = []  # where each starts
         self._end = 0  # of the file
         self._free: list[_Run] = []  # by place, none beside another
         self._dropped: collections.deque[_Run] = collections.deque()
+        self._extents: collections.deque[weakref.ref[_Extent]] = (
+            collections.deque()
+        )  # what was compared last is last
+        self._is_damaged = False
 
     def put(self, arrays: Sequence[NDArray[Any]]) -> dict[int, NDArray[Any]]:
         """Move arrays, at least one, to the file.
@@ -73,13 +89,44 @@ class PageFile:
             self._dropped.append(run)
             raise
         start, segment = next(s for s in reversed(self._segments) if s[0] <= run.start)
-        extent = _Extent((run.n_bytes,), np.uint8, segment, run.start - start)
+        extent = _Extent((run.n_bytes,), np.uint8, segment.buffer, run.start - start)
+        extent.digest = zlib.crc32(content.data)
+        self._extents.append(weakref.ref(extent))
         weakref.finalize(extent, self._dropped.append, run).atexit = False
         moved: dict[int, NDArray[Any]] = {}
         for array, at in zip(arrays, starts, strict=False):
             moved[id(array)] = np.ndarray(array.shape, array.dtype, extent, at)
             moved[id(array)].flags.writeable = array.flags.writeable
         return moved
+
+    def verify(self, *things: object) -> None:
+        """Compare what records have here with its checksums; `check` tells."""
+        for extent in {
+            id(e): e for array in _arrays(*things) if (e := _extent_of(array)) is not None
+        }.values():
+            self._is_damaged = self._is_damaged or not extent.is_sound
+
+    def scrub(self) -> None:
+        """Compare the run whose turn it is; `check` tells."""
+        while self._extents:
+            extent = self._extents.popleft()()
+            if extent is not None:
+                self._extents.append(weakref.ref(extent))
+                self._is_damaged = self._is_damaged or not extent.is_sound
+                return
+
+    def check(self) -> None:
+        """To be asked when something was computed from arrays here; from any thread.
+
+        Raises:
+            MapDamagedError: the disk could not read all of them back, and never will.
+        """
+        cut_off = self._fd >= 0 and os.fstat(self._fd).st_size < self._end
+        if self._is_damaged or cut_off or any(segment.is_lost for _, segment in self._segments):
+            raise MapDamagedError(
+                "the disk cannot read back a part of the map that lay on pages. All that was acknowledged is in the store:"
+                " restart the server to read it, and look at the disk"
+            )
 
     @property
     def n_bytes(self) -> int:
@@ -129,7 +176,7 @@ class PageFile:
             self._fd, name = tempfile.mkstemp(dir=self._folder, prefix="pages-")
             Path(name).unlink()  # a kill leaves nothing behind, and nobody can cut it off under us
         os.ftruncate(self._fd, self._end + n_bytes)
-        self._segments.append((self._end, mmap.mmap(self._fd, n_bytes, offset=self._end)))
+        self._segments.append((self._end, MappedFile(self._fd, n_bytes, self._end)))
         self._free.append(_Run(self._end, n_bytes))
         self._end += n_bytes
 
@@ -146,7 +193,7 @@ class Pages:
         """
         self.max_resident_bytes = max_resident_bytes
         self.file = PageFile(folder)
-        self._seen: Mapping[TileIndex, MapPart] = {}
+        self._seen: TiledMap | None = None  # as it was last
         self._resident: dict[TileIndex, int] = {}  # bytes of each part, last changed last
 
     def relieve(self, tiled: TiledMap) -> TiledMap:
@@ -155,6 +202,8 @@ class Pages:
         Raises:
             OSError: the disk refuses; the map is as it was.
         """
+        self.verify(tiled)
+        self.file.scrub()
         self._look(tiled)
         n_bytes = sum(self._resident.values())
         if n_bytes <= self.max_resident_bytes:
@@ -171,8 +220,8 @@ class Pages:
             n_bytes -= of_part
         for number in moved:
             del self._resident[number]
-        self._seen = parts
-        return tiled._replace(tiles=tiles, parts=parts)
+        self._seen = tiled._replace(tiles=tiles, parts=parts)
+        return self._seen
 
     def keep(self, tile: Tile) -> Tile:
         """A tile of a map that is being read, on pages.
@@ -206,22 +255,38 @@ class Pages:
         """Move no more; what is on pages stays readable."""
         self.file.close()
 
+    def verify(self, tiled: TiledMap) -> None:
+        """Compare pages that went into what has changed since the last `relieve`; `PageFile.check` tells.
+
+        To be called before a map is kept anywhere: what was made of damaged numbers would get a sound checksum there.
+        """
+        seen = self._seen
+        for number, _ in self._changed(tiled):
+            if seen is not None and number in seen.parts and number not in self._resident:
+                self.file.verify(_members(seen, number), *_heavy(seen.parts[number]))
+
     def _look(self, tiled: TiledMap) -> None:
         """Note which parts have changed since the last time, and what they take."""
-        for number, part in tiled.parts.items():
-            if self._seen.get(number) is not part:
-                self._resident.pop(number, None)
-                members = [tiled.tiles[index] for index in tiles_of_part(number) if index in tiled.tiles]
-                n_bytes = sum(array.nbytes for array in _in_memory(members, *_heavy(part)))
-                if n_bytes:
-                    self._resident[number] = n_bytes
+        for number, part in self._changed(tiled):
+            self._resident.pop(number, None)
+            n_bytes = sum(array.nbytes for array in _in_memory(_members(tiled, number), *_heavy(part)))
+            if n_bytes:
+                self._resident[number] = n_bytes
         for number in [number for number in self._resident if number not in tiled.parts]:
             del self._resident[number]
-        self._seen = tiled.parts
+        self._seen = tiled
+
+    def _changed(self, tiled: TiledMap) -> list[tuple[TileIndex, MapPart]]:
+        seen = {} if self._seen is None else self._seen.parts
+        return [(number, part) for number, part in tiled.parts.items() if seen.get(number) is not part]
 
     def _move(self, tiles: tuple[Tile, ...], part: MapPart) -> tuple[tuple[Tile, ...], MapPart]:
         new = self.file.put(_in_memory(tiles, *_heavy(part)))
         return _exchanged((tiles, part), dict(new))
+
+
+def _members(tiled: TiledMap, number: TileIndex) -> list[Tile]:
+    return [tiled.tiles[index] for index in tiles_of_part(number) if index in tiled.tiles]
 
 
 def _heavy(part: MapPart) -> Iterator[object]:
@@ -235,13 +300,17 @@ def _heavy(part: MapPart) -> Iterator[object]:
 
 def _in_memory(*things: object) -> list[NDArray[Any]]:
     """The arrays of records that are worth a move and not on pages yet, each once."""
+    return [a for a in _arrays(*things) if a.nbytes >= _LEAST_BYTES and _extent_of(a) is None]
+
+
+def _arrays(*things: object) -> list[NDArray[Any]]:
+    """All arrays of records, each once."""
     found: dict[int, NDArray[Any]] = {}
     left = list(things)
     while left:
         thing = left.pop()
         if isinstance(thing, np.ndarray):
-            if thing.nbytes >= _LEAST_BYTES and not _is_paged(thing):
-                found[id(thing)] = thing
+            found[id(thing)] = thing
         elif isinstance(thing, tuple | list):
             left.extend(thing)
         elif dataclasses.is_dataclass(thing):
@@ -249,13 +318,14 @@ def _in_memory(*things: object) -> list[NDArray[Any]]:
     return list(found.values())
 
 
-def _is_paged(array: NDArray[Any]) -> bool:
+def _extent_of(array: NDArray[Any]) -> _Extent | None:
+    """The run of the file that it lies in."""
     base: object = array
     while isinstance(base, np.ndarray):
         if isinstance(base, _Extent):
-            return True
+            return base
         base = base.base
-    return False
+    return None
 
 
 def _exchanged(thing: Any, new: dict[int, Any]) -> Any:

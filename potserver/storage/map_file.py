@@ -11,7 +11,7 @@ import contextlib
 import dataclasses
 import sqlite3
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from types import TracebackType
 from typing import Any, NamedTuple
@@ -168,9 +168,12 @@ class MapFile:
         self._epoch = None if saved is None else saved.record.epoch
         return saved
 
-    def write(self, state: MapState, origin: Origin) -> int:
+    def write(self, state: MapState, origin: Origin, check: Callable[[], None] = lambda: None) -> int:
         """Make the file hold a map, in one transaction: tiles of the same epoch and revision are there already.
 
+        Args:
+            state, origin: The map.
+            check: Called when all of it has been read; what it raises undoes the transaction.
         Returns:
             Bytes of the tiles that were written.
         Raises:
@@ -199,6 +202,7 @@ class MapFile:
                 n_bytes += len(data)
             record = sealed(msgspec.json.encode(_record_of(state, origin, known)))
             self._connection.execute("INSERT OR REPLACE INTO map VALUES (0, ?)", (record,))
+            check()
         self._written, self._epoch = known, state.epoch
         return n_bytes
 
@@ -220,9 +224,12 @@ class MapFile:
         self.close()
 
 
-def write_map(path: Path, state: MapState, origin: Origin) -> int:
+def write_map(path: Path, state: MapState, origin: Origin, check: Callable[[], None] = lambda: None) -> int:
     """Write a `*.map` file, whole or not at all; it is on the disk when this returns.
 
+    Args:
+        path: The file.
+        state, origin, check: See `MapFile.write`.
     Returns:
         Bytes of the file.
     Raises:
@@ -234,7 +241,7 @@ def write_map(path: Path, state: MapState, origin: Origin) -> int:
             make_private_folder(path.parent)
             partial.unlink(missing_ok=True)
             with MapFile(partial, wal=False) as file:
-                file.write(state, origin)
+                file.write(state, origin, check)
             n_bytes = partial.stat().st_size
             partial.replace(path)
             sync_folder(path.parent)

@@ -27,6 +27,7 @@ from potserver.domain.order import CloudOrder, Heard
 from potserver.domain.pages import Pages
 from potserver.domain.types import ParamsKind, Scan
 from potserver.errors import (
+    MapDamagedError,
     MapFileError,
     PotserverError,
     StorageError,
@@ -170,6 +171,7 @@ class MapStore:
             if keeps_epoch:
                 self._written = mapper.state.epoch, mapper.state.map_revision
         n_replayed = self._replay(mapper, order)
+        self.check_readable()
         self._begin(mapper.state, order.heard, standing, mark)
         log.info(
             "map_restored",
@@ -225,8 +227,17 @@ class MapStore:
                 log.info("journal_replaying", map_id=self._map_id, n_scans=n, n_done=done)
         return done
 
+    def check_readable(self) -> None:
+        """To be asked when something was computed from the map; from any thread.
+
+        Raises:
+            MapDamagedError: the disk could not read back a part of it.
+        """
+        self._pages.file.check()
+
     def check_takes(self) -> None:
-        """All scans are welcome."""
+        """Raises MapDamagedError: nothing can be added to such a map."""
+        self.check_readable()
 
     # --- scans ----------------------------------------------------------------------------------------------
 
@@ -238,7 +249,7 @@ class MapStore:
             To be called when the scan is about to enter the map; it is on the disk when that returns.
 
         Raises (what is called):
-            StorageError: the disk refuses; the scan must not enter the map.
+            StorageError: the disk refuses; the scan must not enter the map. MapDamagedError: see `check_readable`.
         """
         payload = encode_cloud(scan)
         staged = self._stager.submit(
@@ -251,6 +262,7 @@ class MapStore:
 
     def _keep(self, n_bytes: int, staged: concurrent.futures.Future[None]) -> None:
         started_s = time.perf_counter()
+        self.check_readable()
         try:
             staged.result()
             self._journal.count_staged(self._check_files)
@@ -294,7 +306,10 @@ class MapStore:
 
         Raises:
             StorageError: the disk refuses; what was kept before still is, and the state must not become the map.
+            MapDamagedError: likewise, see `check_readable`.
         """
+        if state.tiled is not None:
+            self._pages.verify(state.tiled)
         with self._writing:
             newest = _Newest(state, heard, self._number)
             self._write(newest)
@@ -319,7 +334,8 @@ class MapStore:
                 f"{len(others)} maps are saved already, the limit is {MAX_SAVED}: move some out of {self._saved}"
             )
         make_private_folder(self._saved.parent)
-        n_bytes = write_map(path, state, Origin(self._map_id, self._keeps_evidence, heard))
+        origin = Origin(self._map_id, self._keeps_evidence, heard)
+        n_bytes = write_map(path, state, origin, self.check_readable)
         self._health.count("store.saved")
         return f"{state.n_scans} scans saved as {path}, {n_bytes} bytes"
 
@@ -372,7 +388,7 @@ class MapStore:
                 complete_to = newest.number
             self._journal.close(complete_to=complete_to)
             return True
-        except StorageError as error:
+        except (StorageError, MapDamagedError) as error:
             # the journal has it all
             log.error("last_snapshot_failed", map_id=self._map_id, detail=str(error))
             return False
@@ -416,7 +432,7 @@ class MapStore:
                 try:
                     if newest is not None:
                         self._write(newest)
-                except StorageError as error:
+                except (StorageError, MapDamagedError) as error:
                     # the scans are safe in the journal, which grows until a snapshot succeeds
                     self._health.count("store.snapshots_failed")
                     log.warning("snapshot_failed", map_id=self._map_id, detail=str(error))
@@ -435,7 +451,7 @@ class MapStore:
             self._edition + 1,
         )
         self._check_files()
-        n_bytes = self._tiles.write(newest.state, origin)
+        n_bytes = self._tiles.write(newest.state, origin, self.check_readable)
         self._check_files()
         self._edition += 1
         self._advance_mark(edition=self._edition)
@@ -472,6 +488,9 @@ class MemoryOnly:
     """Keeps nothing: the store of a map that lives in memory."""
 
     durable = False
+
+    def check_readable(self) -> None:
+        """Nothing lies on pages."""
 
     def check_takes(self) -> None:
         """All scans are welcome."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import shutil
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
 
 from potserver.domain.map_state import MapState
@@ -59,6 +60,7 @@ class ReadOnlyStore:
         self._folder, self._map_id = folder, map_id
         self._keeps_evidence, self._health = keeps_evidence, health
         self._max_resident_bytes = max_resident_bytes
+        self.check_readable: Callable[[], None] = lambda: None  # see `MapStore`
 
     def restore(self, mapper: MappingService) -> Restored:
         """Give an empty mapper the map that is kept, see `MapStore.restore`.
@@ -77,6 +79,7 @@ class ReadOnlyStore:
                 fsync=False,
                 max_resident_bytes=self._max_resident_bytes,
             )
+            self.check_readable = store.check_readable
             try:
                 return store.restore(mapper)
             finally:

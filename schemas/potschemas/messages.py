@@ -625,7 +625,7 @@ class Stats(Message, frozen=True, kw_only=True):
     server: Identifier  # its id in the key space
     stamp_ns: Sequence  # when the counters were read
     uptime_s: Finite  # s
-    state: str  # serving | draining
+    state: str  # serving | draining | damaged: restart it
     counters: dict[str, Count]  # e.g. clouds.accepted, clouds.rejected.bad_pose, queries.points.ok
     queues: dict[str, Count]  # e.g. clouds.depth, clouds.bytes, queries.depth
     latencies: dict[str, LatencySummary]  # e.g. integrate, points, grid
@@ -671,6 +671,7 @@ class ErrorCode(str, Enum):
     OLD_STAMP = "old_stamp"  # too far ahead of the server's clock
     OLD_SEQ = "old_seq"  # not above the last accepted cloud of the robot's session
     MAP_FULL = "map_full"  # the map has as many bytes, or robots, as it may
+    MAP_DAMAGED = "map_damaged"  # a part of the map that lay on the server's disk cannot be read back
     NO_POSE = "no_pose"  # no pose given, and none to interpolate at the stamp
     UNKNOWN_ROBOT = "unknown_robot"  # not a legal id, or not on the allow list
     UNKNOWN_ATOM = "unknown_atom"  # not in the dictionary
@@ -680,6 +681,7 @@ class ErrorCode(str, Enum):
     READ_ONLY = "read_only"  # the server takes no changes of its dictionary, or of anything
     UNSUPPORTED = "unsupported"  # no such operation or verb
     OVERLOADED = "overloaded"  # the queue is full; retry after retry_after_s
+    TOO_MANY = "too_many"  # this client asks faster than one may; retry after retry_after_s
     DEADLINE = "deadline"  # the deadline passed before the work could start
     SHUTTING_DOWN = "shutting_down"  # the server takes no more work
     STORAGE = "storage"  # the server's disk did not take it; nothing was changed

@@ -8,8 +8,9 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
+from potserver.adapters.fairness import Rates
 from potserver.adapters.query_pool import QueryJob, QueryPool
-from potserver.errors import OverloadedError, PotserverError, ShuttingDownError
+from potserver.errors import OverloadedError, PotserverError, ShuttingDownError, TooManyError
 
 DEADLINE_S = 30.0
 
@@ -187,3 +188,29 @@ def test_closing_refuses_what_waits_and_what_is_between_its_parts(desk: Desk, ma
     closing.join(DEADLINE_S)
     with pytest.raises(ShuttingDownError):
         pool.submit(desk.job("late", "A"))
+
+
+def test_who_asks_too_often_is_told_when_to_come_back_and_others_are_not_held_up() -> None:
+    now_s = 100.0
+    rates = Rates(10.0, lambda: now_s)
+    for _ in range(10):  # a second's worth at once
+        rates.check("A")
+    with pytest.raises(TooManyError, match="more than 10 questions a second") as early:
+        rates.check("A")
+    rates.check("B")
+    now_s += early.value.retry_after_s or 0.0
+    rates.check("A")
+    with pytest.raises(TooManyError):
+        rates.check("A")
+    now_s += 60.0
+    for _ in range(10):
+        rates.check("A")
+
+
+def test_askers_that_came_long_ago_are_not_remembered() -> None:
+    now_s = 0.0
+    rates = Rates(10.0, lambda: now_s)
+    for number in range(3 * 4096):
+        rates.check(f"{number}")
+        now_s += 1.0
+    assert len(rates._due_s) <= 4096

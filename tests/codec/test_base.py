@@ -38,9 +38,9 @@ def test_errors_travel_by_code(code: ErrorCode) -> None:
     )
 
 
-def test_only_load_shutdown_and_a_full_disk_are_worth_another_try() -> None:
+def test_only_load_shutdown_and_the_disk_are_worth_another_try() -> None:
     retryable = {code for code, kind in error_classes().items() if kind.retryable}
-    assert retryable == {"overloaded", "deadline", "shutting_down", "storage"}
+    assert retryable == {"overloaded", "too_many", "deadline", "shutting_down", "storage", "map_damaged"}
 
 
 @pytest.mark.parametrize("code", [ErrorCode.TOO_LARGE, ErrorCode.BAD_MESSAGE, ErrorCode.BAD_ARRAY])

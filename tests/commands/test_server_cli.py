@@ -9,6 +9,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -266,6 +267,25 @@ def test_the_first_signal_sets_a_flag_and_handlers_are_put_back() -> None:
         stop.wait()
         assert stop.name == "SIGTERM"
     assert (signal.getsignal(signal.SIGTERM), signal.getsignal(signal.SIGINT)) == before
+    assert signal.set_wakeup_fd(-1) == -1
+
+
+def test_a_signal_that_another_thread_gets_ends_the_wait() -> None:
+    """As one does that comes just before the wait: neither interrupts it."""
+    main = threading.main_thread().ident
+    assert main is not None
+
+    def kill() -> None:
+        while sys._current_frames()[main].f_code is not StopSignals.wait.__code__:
+            threading.Event().wait(0.01)
+        signal.pthread_kill(threading.get_ident(), signal.SIGTERM)
+
+    with StopSignals.installed() as stop:
+        thread = threading.Thread(target=kill)
+        thread.start()
+        stop.wait()
+        thread.join()
+    assert stop.name == "SIGTERM"
 
 
 # --- the log ------------------------------------------------------------------------------------------------

@@ -3,6 +3,11 @@
 from __future__ import annotations
 
 import gc
+import mmap
+import os
+import signal
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +16,7 @@ import pytest
 from potserver.domain.pages import PageFile, Pages
 from potserver.domain.tiles import TiledMap, part_of
 from potserver.domain.types import Scan, yaw_pose
+from potserver.errors import MapDamagedError
 from potserver.mapping.service import MappingService
 from potserver.mapping.settings import MappingSettings
 from potserver.storage.tile_codec import encode_tile
@@ -110,6 +116,99 @@ def test_the_coldest_parts_leave_memory_first(tmp_path: Path) -> None:
     mapper.relieve(pages)
     assert pages._resident == {}
     assert before <= pages.file.n_bytes < 1.5 * before
+
+
+def test_what_the_disk_does_not_read_back_is_told(tmp_path: Path) -> None:
+    file, other = PageFile(tmp_path), PageFile(tmp_path)
+    array = np.ones(100_000)
+    (paged,), (sound,) = (list(f.put([array]).values()) for f in (file, other))
+    file.check()
+    os.ftruncate(file._fd, 2 * mmap.PAGESIZE)  # as unreadable as a sector that has gone bad
+    with pytest.raises(MapDamagedError, match="restart the server"):  # before anybody meets it
+        file.check()
+    os.ftruncate(file._fd, file._end)
+    file.check()
+    os.ftruncate(file._fd, 2 * mmap.PAGESIZE)
+    assert paged.sum() == 2 * mmap.PAGESIZE / 8, "zeros, and the process lives"
+    os.ftruncate(file._fd, file._end)
+    with pytest.raises(MapDamagedError, match="restart the server"):
+        file.check()
+    file.close()
+    with pytest.raises(MapDamagedError, match="restart the server"):
+        file.check()
+    other.check()
+    assert sound.sum() == len(array)
+
+
+def flip(file: PageFile, place: int) -> None:
+    (byte,) = os.pread(file._fd, 1, place)
+    os.pwrite(file._fd, bytes([byte ^ 1 << place % 8]), place)
+
+
+def test_a_bit_that_flips_anywhere_is_found_when_the_turn_comes(tmp_path: Path) -> None:
+    file = PageFile(tmp_path)
+    kept = [file.put([np.random.default_rng(i).normal(size=900)]) for i in range(3)]
+    end = file.n_bytes
+    for place in range(0, end, 64):
+        flip(file, place)
+        for _ in kept:
+            file.scrub()
+        with pytest.raises(MapDamagedError):
+            file.check()
+        flip(file, place)
+        file._is_damaged = False
+    for _ in kept:
+        file.scrub()
+    file.check()
+
+
+def test_a_scan_on_damaged_pages_is_kept_nowhere(tmp_path: Path) -> None:
+    mapper, pages = MappingService(settings=SETTINGS, threads=1), Pages(tmp_path, 1)
+    for seq, x_m in enumerate((0.0, 120.0, 240.0)):
+        mapper.integrate(scan_at(x_m, seq))
+        mapper.relieve(pages)
+    before = mapper.state.tiled
+    assert before is not None
+    end = pages.file.n_bytes
+    mapper.integrate(scan_at(1.0, 3))
+    assert mapper.state.tiled is not None
+    pages.verify(mapper.state.tiled)
+    pages.file.check()
+    n_found = 0
+    for place in range(0, end, 4096):
+        flip(pages.file, place)
+        pages.verify(mapper.state.tiled)
+        n_found += pages.file._is_damaged
+        flip(pages.file, place)
+        pages.file._is_damaged = False
+    changed = {id(part) for part in before.parts.values()} - {
+        id(part) for part in mapper.state.tiled.parts.values()
+    }
+    assert 0 < len(changed) < len(before.parts)
+    assert 0.1 < n_found / (end / 4096) < 0.6, (
+        "of the room that was seen again; of the others nothing was taken"
+    )
+
+
+def test_a_bus_error_elsewhere_is_not_ours(tmp_path: Path) -> None:
+    """Neither before nor after one that is."""
+    code = f"""
+import mmap, os, sys
+from pathlib import Path
+import numpy as np
+from potserver.domain.pages import PageFile
+file = PageFile(Path({str(tmp_path)!r}))
+(paged,) = file.put([np.ones(100_000)]).values()
+os.ftruncate(file._fd, 0)
+print(paged.sum(), flush=True)
+with open({str(tmp_path / "foreign")!r}, "w+b") as foreign:
+    foreign.truncate(mmap.PAGESIZE)
+    mapped = mmap.mmap(foreign.fileno(), mmap.PAGESIZE)
+    foreign.truncate(0)
+    mapped[0]
+"""
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+    assert (run.stdout, run.returncode) == ("0.0\n", -signal.SIGBUS), run.stderr
 
 
 def test_a_disk_that_refuses_leaves_the_map_in_memory(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 from contextlib import ExitStack
 from pathlib import Path
@@ -10,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from potclient import MapClient
+from potclient import MapClient, MapDamagedError
 from potschemas import messages, wire
 from potserver.config import load_settings
 from potserver.server import MapServer
@@ -118,6 +119,39 @@ def test_pages_that_the_disk_refuses_stay_in_memory(tmp_path: Path, monkeypatch:
         site.drive("r2", y_m=3.0)
         assert site.server._stores["default"]._pages.file.n_bytes > 1_000_000  # type: ignore[union-attr]
         assert answer.observed.any()
+
+
+def test_a_map_that_cannot_be_read_back_is_never_answered_from(tmp_path: Path) -> None:
+    """Not a question, not a cloud, not a verb; and a restart has all that was acknowledged."""
+    with ExitStack() as stack:
+        site = Site(stack, tmp_path / "store", limits__max_resident_bytes=1)
+        site.drive()
+        wanted = site.says()
+        file = site.server._stores["default"]._pages.file  # type: ignore[union-attr]
+        os.ftruncate(file._fd, 0)
+        ask = site.client
+        for refused in (
+            lambda: ask.occupancy(POINTS),
+            lambda: ask.grid([-8, -7, 0], [48, 7, 1], resolution=0.5),
+            lambda: ask.rays(np.zeros((8, 3)), np.eye(3)[np.arange(8) % 3], 60.0),
+            ask.params,
+            lambda: ask.mirror().update(),
+            lambda: ask.integrate(ROOM, np.eye(4), robot="r1"),
+            lambda: ask.save("bad"),
+            lambda: ask.forget("r1"),
+        ):
+            with pytest.raises(MapDamagedError, match="restart the server"):
+                refused()
+        counters = ask.stats().counters
+        assert counters["queries.points.map_damaged"] == 1
+        assert counters["clouds.dropped.map_damaged"] == 1
+        assert counters["control.save.map_damaged"] == 1
+        assert (ask.stats().state, ask.info().n_scans) == ("damaged", len(PLACES_M))
+    assert not (tmp_path / "store" / "saved" / "default" / "bad.map").exists()
+    with ExitStack() as stack:
+        again = Site(stack, tmp_path / "store")
+        assert again.server.state == "serving"
+        assert_same(wanted, again.says())
 
 
 def test_a_robot_with_its_share_of_the_map_is_refused_and_no_other(tmp_path: Path) -> None:

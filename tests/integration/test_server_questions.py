@@ -14,6 +14,7 @@ import msgspec
 import numpy as np
 import pytest
 
+from potclient import MapClient, TooManyError
 from potschemas import messages, wire
 from potschemas.messages import ErrorCode
 from potserver.domain.types import KernelSet
@@ -72,6 +73,21 @@ def test_a_full_query_queue_answers_at_once_and_loses_nobody(make_rig: MakeRig) 
         assert not refused or (answer.code is ErrorCode.OVERLOADED and answer.retry_after_s == 0.2)
         answers["refused" if refused else "ok"] += 1
     assert answers == {"ok": 4, "refused": 26}
+
+
+def test_who_asks_too_often_is_refused_and_nobody_else(make_rig: MakeRig) -> None:
+    rig = make_rig(queries__max_rate_hz=0.01)  # one now and then
+    hasty = MapClient(rig.server.endpoint)
+    others = rig.client()
+    with hasty:
+        hasty.info()
+        with pytest.raises(TooManyError) as refused:
+            hasty.occupancy([[0.0, 0.0, 0.0]])
+        assert refused.value.retry_after_s is not None
+        assert refused.value.retry_after_s > 1.0
+    assert others.one("points", HERE).map_revision == 0
+    assert rig.server.health.counter("queries.points.too_many") == 1
+    assert rig.server.health.counter("queries.points.ok") == 1
 
 
 def test_work_past_its_deadline_is_not_started(make_rig: MakeRig) -> None:

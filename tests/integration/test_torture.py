@@ -8,10 +8,11 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks import fleet, torture_store
+from benchmarks import fleet, torture_damage
 from benchmarks.torture import run_calls
+from benchmarks.torture_damage import damages, torture_copies, torture_files, torture_pages
 from benchmarks.torture_messages import mutated, torture_messages
-from benchmarks.torture_store import STEPS, Driven, digest, torture_copies, torture_files, wanted
+from benchmarks.torture_store import STEPS, Driven, digest, wanted
 
 
 @pytest.mark.slow
@@ -43,15 +44,27 @@ def test_what_is_lost_would_be_found(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert digest(driven.mapper.state) == wanted(steps)
     assert digest(driven.mapper.state) != wanted(steps[:-1])
     driven.store.close()
-    monkeypatch.setattr(torture_store, "_reopened", lambda store: "0" if "damaged" in store.name else "1")
-    assert any(outcome.wrong for outcome in torture_files(1, 0, lambda line: None))
+    monkeypatch.setattr(torture_damage, "reopened", lambda store: "0" if "damaged" in store.name else "1")
+    assert any(outcome.wrong for outcome in torture_files(100_000, 0, lambda line: None))
 
 
 def test_damage_is_told_or_harmless() -> None:
-    outcomes = torture_files(3, 1, lambda line: None)
-    assert len(outcomes) > 8
+    outcomes = torture_files(40_000, 1, lambda line: None)
+    assert len(outcomes) > 9
     assert [line for outcome in outcomes for line in outcome.wrong] == []
-    assert {word for outcome in outcomes for word in outcome.counts} == {"the same map", "refused"}
+    assert {word for outcome in outcomes for word in outcome.counts} == {"the same", "refused"}
+
+
+def test_damage_of_pages_is_told() -> None:
+    outcome = torture_pages(20_000, 1, lambda line: None)
+    assert outcome.wrong == []
+    assert outcome.counts["refused"] > 10
+
+
+def test_every_run_of_bytes_meets_a_flip() -> None:
+    found = list(damages(1000, 64, random.Random(0)))
+    assert {place // 64 for kind, place in found if kind == "flip"} == set(range(16))
+    assert {kind for kind, place in found if place // 64 == 8} == {"flip", "clear", "cut"}
 
 
 def test_a_copy_of_a_running_store_is_whole_or_refused() -> None:

@@ -7,7 +7,10 @@ from __future__ import annotations
 
 import itertools
 import json
+import os
 import re
+import shutil
+import subprocess
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
@@ -84,6 +87,27 @@ def test_the_base_image_is_pinned(dockerfile: Path) -> None:
     assert set(images) == {"${BASE}"}, "whoever builds may name a digest"
     (base,) = (rest for word, rest in found if word == "ARG" and rest.startswith("BASE="))
     assert re.fullmatch(r"BASE=python:3\.\d+(\.\d+)?-slim-\w+(@sha256:[0-9a-f]{64})?", base), base
+
+
+@pytest.mark.parametrize("digest", ["sha256:" + "0a" * 32, "not a digest"])
+def test_the_digest_of_the_base_is_written_into_both_files(root: Path, tmp_path: Path, digest: str) -> None:
+    """A stand-in for skopeo tells it."""
+    shutil.copytree(root / "docker", tmp_path / "docker")
+    skopeo = tmp_path / "skopeo"
+    skopeo.write_text(f'#!/bin/sh\necho "$*" >{tmp_path}/asked\necho "{digest}"\n')
+    skopeo.chmod(0o755)
+    environ = os.environ | {"PATH": f"{tmp_path}:{os.environ['PATH']}"}
+    for _ in range(2):  # from a tag, and from a digest
+        run = subprocess.run(
+            [tmp_path / "docker" / "check", "--pin"], env=environ, capture_output=True, text=True
+        )
+        assert (tmp_path / "asked").read_text().split()[-1] == "docker://python:3.11-slim-bookworm"
+        for name in DOCKERFILES:
+            before, after = ((folder / "docker" / name).read_text() for folder in (root, tmp_path))
+            wanted = f"ARG BASE=python:3.11-slim-bookworm@{digest}" if run.returncode == 0 else None
+            changed = [line for line in after.splitlines() if line not in before.splitlines()]
+            assert changed == ([wanted] if wanted else [])
+    assert run.returncode == (0 if digest.startswith("sha256:") else 1), run.stderr
 
 
 def test_packages_are_pinned_by_hash(dockerfile: Path) -> None:

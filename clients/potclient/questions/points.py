@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from potclient.arguments import as_points
-from potclient.errors import OverloadedError
+from potclient.errors import OverloadedError, TooManyError
 from potclient.link import Link
 from potclient.occupancy import Occupancy
 from potclient.questions import info
@@ -69,7 +69,7 @@ class PointsQuestion:
                 try:
                     yield Occupancy.from_message(next(replies), len(chunk), with_gradient=wanted.gradient)
                     break
-                except OverloadedError as error:
+                except (OverloadedError, TooManyError) as error:
                     if attempt == _RETRIES:
                         raise
                     time.sleep(error.retry_after_s or 0.1)

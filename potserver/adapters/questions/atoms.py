@@ -80,6 +80,13 @@ def _change(asked: Asked, query: messages.AtomsQuery) -> messages.AtomsChanged:
     return messages.AtomsChanged(**change._asdict())
 
 
-QUESTION = Question(op="atoms", query=messages.AtomsQuery, plan=_plan_read, each=the_part)
+QUESTION = Question(op="atoms", query=messages.AtomsQuery, plan=_plan_read, each=the_part, reads_tiles=False)
 # the newcomer is compared with the whole dictionary
-CHANGE = Question(op="atoms", query=messages.AtomsQuery, plan=_plan_change, each=the_part, is_quick=False)
+CHANGE = Question(
+    op="atoms",
+    query=messages.AtomsQuery,
+    plan=_plan_change,
+    each=the_part,
+    is_quick=False,
+    reads_tiles=False,
+)

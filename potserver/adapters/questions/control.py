@@ -17,7 +17,7 @@ from potserver.adapters.outbox import Outbox
 from potserver.adapters.queryable import Queryable
 from potserver.adapters.questions import atoms
 from potserver.adapters.questions.question import Served
-from potserver.adapters.replies import BUG, asker_of, check_query, payload_of, reply, reply_error
+from potserver.adapters.replies import asker_of, check_query, failure, payload_of, reply, reply_error
 from potserver.adapters.writer import MapWriter
 from potserver.codec.base import decode, encode
 from potserver.codec.clouds import decode_transform
@@ -155,11 +155,9 @@ class ControlQueryable(Queryable):
                 message = work()
                 self._served.audit.changed(f"control.{verb}", asker_of(query), result=message)
                 self._done(query, verb, message)
-            except PotserverError as error:
-                self.refuse(query, error)
-            except Exception:
-                log.exception("control_failed", key=self._keys.control(verb))
-                self.refuse(query, PotserverError(BUG))
+            except Exception as error:
+                check, key = self._served.check_readable, self._keys.control(verb)
+                self.refuse(query, failure(error, check, log, "control_failed", key=key))
 
         self._intake.admit_barrier(
             Barrier(run, lambda error: self.refuse(query, error)), is_last=verb == DRAIN

@@ -51,4 +51,11 @@ def _plan(asked: Asked, _query: messages.InfoQuery) -> Single:
     return Single(lambda: _encode(asked), is_short=True)
 
 
-QUESTION = Question(op="info", query=messages.InfoQuery, plan=_plan, each=the_part, max_bytes=MAX_SMALL_BYTES)
+QUESTION = Question(
+    op="info",
+    query=messages.InfoQuery,
+    plan=_plan,
+    each=the_part,
+    reads_tiles=False,
+    max_bytes=MAX_SMALL_BYTES,
+)

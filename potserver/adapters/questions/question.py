@@ -35,6 +35,9 @@ class Served:
     audit: Audit
     limits: Limits
     durable: bool  # accepted clouds survive a crash
+    check_readable: Callable[[], None] = lambda: (
+        None
+    )  # raises MapDamagedError: what was computed may be wrong
     tiles: TileMemory = dataclasses.field(default_factory=TileMemory)  # as they were sent to mirrors
 
 
@@ -75,6 +78,7 @@ class Question(Generic[QueryT]):
     each: Callable[[Any, int, Any], messages.Message] | None = None  # (plan, number, part): a reply a part
     whole: Callable[[Any, list[Any]], messages.Message] | None = None  # (plan, parts): one reply of all parts
     is_quick: bool = True  # to plan: the worker of short questions may look whether this is one
+    reads_tiles: bool = True  # which may lie on pages that the disk cannot read back
     max_bytes: int | None = None  # of the query; None = `Limits.max_query_bytes`
     warm_up: Callable[[KernelMap], object] | None = None  # compiles what the answer uses, on a small map
 
