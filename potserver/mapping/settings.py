@@ -36,7 +36,7 @@ class MappingSettings:
     # forgetting
     gone_odds: Annotated[
         float, "odds against beams missing what is still there, beyond which it has left; 0: nothing leaves"
-    ] = 100_000.0
+    ] = 1e9
     half_life_s: Annotated[
         float, "time in which evidence that nobody renews loses half its weight, by stamps; 0: it never does"
     ] = 0.0
