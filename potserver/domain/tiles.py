@@ -35,7 +35,7 @@ _PART = (
 )
 FREE = ""  # in the list of robots: a number that belongs to nobody
 _ROW_BYTES, _KERNEL_BYTES = 31, 122  # of a row; of a kernel in its tile and ready to be asked
-_LEAN_M, _LEAN_LEVEL_M = 2.5, 0.25  # between the nodes of a lean, across and upwards, about
+LEAN_M, LEAN_LEVEL_M = 1.0, 0.25  # between the nodes of a lean, across and upwards, about
 _MOST_LEAN_CELLS = 127  # of a tile along an axis
 _VOXELS_OF_PAIR = 5  # two coarse cells are five fine ones: the least length that every lattice divides
 
@@ -155,7 +155,7 @@ class TileGrid(NamedTuple):
     def lean_nodes(self) -> tuple[int, int, int]:
         """Nodes of a tile's lean along x, y and z, from corner to corner."""
         across, up = (
-            min(max(round(self.size_m / step), 1), _MOST_LEAN_CELLS) + 1 for step in (_LEAN_M, _LEAN_LEVEL_M)
+            min(max(round(self.size_m / step), 1), _MOST_LEAN_CELLS) + 1 for step in (LEAN_M, LEAN_LEVEL_M)
         )
         return across, across, up
 
@@ -373,6 +373,14 @@ class Region:
         ]
         x0, y0, z0 = self.lower
         return [(x, y, z) for x, y, z in itertools.product(*axes) if not seen[x - x0, y - y0, z - z0]]
+
+    def leans(self, points: Float64) -> Bool:
+        """(N,) which of (N, 3) points of the region lie in tiles that lean."""
+        has = np.zeros(tuple(self.size), bool)
+        for index in self.lean:
+            has[tuple(np.subtract(index, self.lower))] = True
+        tile = np.clip(np.floor(points / self.grid.size_m), 0, self.size - 1).astype(np.int64)
+        return np.asarray(has[tuple(tile.T)])
 
     def lean_at(self, points: Float64, threads: int) -> Float32 | None:
         """(N,) log-odds at (N, 3) points of the region, 0 where its tiles do not lean; None if none does."""
