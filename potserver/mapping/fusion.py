@@ -52,7 +52,7 @@ _SUPPORT_OF_NOTHING = 0.05  # of a kernel; with so much support its variance is 
 _WORTH_OF_HALF = 0.25  # of a row in a voxel of half the resolution, which has an eighth of the volume
 _SATURATION = 20.0  # looks at one place that count in a solve; further ones repeat them
 # Of the prior variance, beside a lean: a kernel with all of it goes beyond what few rows ask for, and reaches through faces.
-_OPEN_BESIDE_LEAN = 0.1
+_OPEN_BESIDE_LEAN = 0.2
 _CHEAP_VALUES = 60_000_000  # features that a solve may touch for more Newton steps than it must take
 
 

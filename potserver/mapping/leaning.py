@@ -22,8 +22,7 @@ _JUDGED_BY, _JUDGED = 1_000, 3_000  # beams that tell of labels of the others, l
 _EYE_M = (LOWEST_EYE_M, 5.0)  # heights of a sensor above the ground that are expected
 _STEEPEST = 0.3  # slope of a ground
 _SURE_OF_MODEL = 5.0  # precision of the scale about 1
-_SUREST = 4.0  # log-odds: made-up towns are tidier than real streets
-_LEAST_SCALE = 0.25  # with less of it, the model does not fit here
+_LEAST_SCALE = 0.4  # with less of it, the model does not fit here
 _REACH_M = (-1.5, 6.0)  # heights between which something is expected
 
 NO_MODEL, PLANAR, NO_GROUND, NOVEL = (
@@ -44,8 +43,7 @@ class Expected(NamedTuple):
 
     def at(self, points: Float64) -> Float64:
         """(N,) log-odds at (N, 3) points, m, map frame."""
-        told = self.view.expected(points - self.origin, self.net)
-        return self.scale * np.clip(told, -_SUREST, _SUREST)
+        return self.scale * self.view.expected(points - self.origin, self.net)
 
 
 class Expectation(NamedTuple):
