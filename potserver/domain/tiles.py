@@ -374,14 +374,6 @@ class Region:
         x0, y0, z0 = self.lower
         return [(x, y, z) for x, y, z in itertools.product(*axes) if not seen[x - x0, y - y0, z - z0]]
 
-    def leans(self, points: Float64) -> Bool:
-        """(N,) which of (N, 3) points of the region lie in tiles that lean."""
-        has = np.zeros(tuple(self.size), bool)
-        for index in self.lean:
-            has[tuple(np.subtract(index, self.lower))] = True
-        tile = np.clip(np.floor(points / self.grid.size_m), 0, self.size - 1).astype(np.int64)
-        return np.asarray(has[tuple(tile.T)])
-
     def lean_at(self, points: Float64, threads: int) -> Float32 | None:
         """(N,) log-odds at (N, 3) points of the region, 0 where its tiles do not lean; None if none does."""
         if not self.lean:

@@ -51,8 +51,6 @@ _MEMORY = 200.0  # looks that one place remembers; older ones give way
 _SUPPORT_OF_NOTHING = 0.05  # of a kernel; with so much support its variance is half the prior's
 _WORTH_OF_HALF = 0.25  # of a row in a voxel of half the resolution, which has an eighth of the volume
 _SATURATION = 20.0  # looks at one place that count in a solve; further ones repeat them
-# Of the prior variance, beside a lean: a kernel with all of it goes beyond what few rows ask for, and reaches through faces.
-_OPEN_BESIDE_LEAN = 0.2
 _CHEAP_VALUES = 60_000_000  # features that a solve may touch for more Newton steps than it must take
 
 
@@ -327,11 +325,6 @@ def _fits_budget(present: Float64, added: Float64, grid: TileGrid, limit: int) -
     return place[len(present) :] < limit
 
 
-def _left_open(prior_var: Float32, leans: Bool) -> Float32:
-    """(K,) the variance that a solve starts from: what is expected already leaves less to the kernels that lean."""
-    return np.where(leans, np.float32(_OPEN_BESIDE_LEAN) * prior_var, prior_var)
-
-
 class _Support(NamedTuple):
     """How much evidence stands behind each of K kernels."""
 
@@ -391,7 +384,7 @@ def _fit(region: Region, lower: Float64, upper: Float64, options: FusionOptions,
     n_newton = int(np.clip(cheap, effort.newton_steps, effort.most_newton_steps))
     prior = Prior(
         region.kernels.prior_mean[local],
-        _left_open(region.kernels.prior_var[local], region.leans(hinge)),
+        region.kernels.prior_var[local],
         region.lean_at(where[rows], threads),
     )
     fit = warm_fit(
