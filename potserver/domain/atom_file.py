@@ -1,7 +1,7 @@
 """The file of an atom dictionary, `*.atoms`: a safetensors container that any reader of that format opens.
 
     header    names, dtypes, shapes and places of the arrays; one metadata entry, a canonical JSON of the version, per atom
-              id, dims, radius_m, azimuth_width_rad and provenance, and maybe the height models of the recordings
+              id, dims, radius_m, azimuth_width_rad and provenance, and maybe what the recordings teach to expect
     int64     hit_offsets, free_offsets, kernel_offsets (A + 1,): atom i has the rows offsets[i] to offsets[i + 1]
     float32   hit_points (H, 3), free_points (F, 3) and the kernels' arrays, of all atoms one after the other
     uint8     sha256 (32,): of every byte of the file before it
@@ -31,7 +31,7 @@ from safetensors.numpy import save as to_safetensors
 from potserver.domain.folders import sync_folder
 from potserver.domain.types import KERNEL_ARRAYS, Atom, KernelSet
 from potserver.errors import BadPointsError, DictionaryError, EmptyError, ShapeError
-from potserver.numerics.heights import HeightModels
+from potserver.numerics.surroundings import Perceptron
 
 VERSION = 2
 _METADATA_KEY = "potserver-atoms"  # one key: safetensors keeps no order between several
@@ -64,10 +64,10 @@ class AtomFile:
         self,
         path: Path,
         records: list[AtomRecord],
-        heights: HeightModels | None,
+        expectation: Perceptron | None,
         arrays: dict[str, NDArray[Any]],
     ) -> None:
-        self.path, self.records, self.heights, self._arrays = path, records, heights, arrays
+        self.path, self.records, self.expectation, self._arrays = path, records, expectation, arrays
 
     def atom(self, number: int) -> Atom:
         """One atom; all its arrays but the kernels' positions are read-only views of its bytes.
@@ -92,13 +92,13 @@ class AtomFile:
             raise DictionaryError(f"{self.path}: atom {record.atom_id!r}: {error}") from error
 
 
-def write_atoms(path: Path, atoms: Sequence[Atom], heights: HeightModels | None = None) -> None:
+def write_atoms(path: Path, atoms: Sequence[Atom], expectation: Perceptron | None = None) -> None:
     """Write a file whole or not at all; it is on the disk when this returns, and replaces an open one without harm.
 
     Raises:
         DictionaryError: the disk refuses.
     """
-    image = _image(atoms, heights)
+    image = _image(atoms, expectation)
     partial = path.with_name(path.name + ".partial")
     try:
         with partial.open("wb") as stream:
@@ -145,11 +145,11 @@ def open_atoms(path: Path) -> AtomFile:
         raise DictionaryError(f"{path} is a safetensors file, but no atom dictionary")
     if hashlib.sha256(memoryview(content)[:-_DIGEST_BYTES]).digest() != content[-_DIGEST_BYTES:]:
         raise DictionaryError(f"{path} is damaged: its SHA-256 does not fit its content")
-    records, heights = _parse_metadata(path, metadata[_METADATA_KEY])
-    return AtomFile(path, records, heights, _arrays_of(path, content, described, len(records)))
+    records, expectation = _parse_metadata(path, metadata[_METADATA_KEY])
+    return AtomFile(path, records, expectation, _arrays_of(path, content, described, len(records)))
 
 
-def _image(atoms: Sequence[Atom], heights: HeightModels | None) -> bytes:
+def _image(atoms: Sequence[Atom], expectation: Perceptron | None) -> bytes:
     arrays: dict[str, NDArray[Any]] = {
         "hit_offsets": _offsets([len(atom.hit_points) for atom in atoms]),
         "free_offsets": _offsets([len(atom.free_points) for atom in atoms]),
@@ -171,8 +171,8 @@ def _image(atoms: Sequence[Atom], heights: HeightModels | None) -> bytes:
         for atom in atoms
     ]
     tree: dict[str, Any] = {"version": VERSION, "atoms": records}
-    if heights is not None:
-        tree["heights"] = {name: values.tolist() for name, values in heights._asdict().items()}
+    if expectation is not None:
+        tree["expectation"] = {name: values.tolist() for name, values in expectation._asdict().items()}
     text = json.dumps(tree, sort_keys=True, separators=(",", ":"), allow_nan=False)
     content = to_safetensors(arrays, metadata={_METADATA_KEY: text})[:-_DIGEST_BYTES]
     return content + hashlib.sha256(content).digest()
@@ -214,7 +214,7 @@ def _arrays_of(
     return arrays
 
 
-def _parse_metadata(path: Path, text: str) -> tuple[list[AtomRecord], HeightModels | None]:
+def _parse_metadata(path: Path, text: str) -> tuple[list[AtomRecord], Perceptron | None]:
     try:
         tree = json.loads(text)
     except (ValueError, RecursionError) as error:
@@ -226,28 +226,19 @@ def _parse_metadata(path: Path, text: str) -> tuple[list[AtomRecord], HeightMode
             f"{path} is of version {tree.get('version')!r}, this program reads version {VERSION}"
         )
     records = [_parse_record(path, number, record) for number, record in enumerate(tree["atoms"])]
-    return records, _parse_heights(path, tree["heights"]) if "heights" in tree else None
+    return records, _parse_expectation(path, tree["expectation"]) if "expectation" in tree else None
 
 
-def _parse_heights(path: Path, told: object) -> HeightModels:
+def _parse_expectation(path: Path, told: object) -> Perceptron:
     try:
-        model = HeightModels(
-            **{name: np.array(values, np.float64) for name, values in cast("dict[str, Any]", told).items()}
-        )
-        sound = (
-            model.heights_m.ndim == model.ranges_m.ndim == 1
-            and model.log_odds.shape == (len(model.log_odds), len(model.heights_m), len(model.ranges_m))
-            and len(model.log_odds) > 0
-            and min(model.log_odds.shape[1:]) >= 2
-            and (np.diff(model.heights_m) > 0).all()
-            and (np.diff(model.ranges_m) > 0).all()
-            and all(np.isfinite(values).all() for values in model)
-        )
+        layers = cast("dict[str, Any]", told).items()
+        net = Perceptron(**{name: np.array(values, np.float32) for name, values in layers})
+        sound = net.is_sound
     except (TypeError, ValueError, AttributeError):
         sound = False
     if not sound:
-        raise DictionaryError(f"{path}: the height models are incomplete, or their numbers are no models'")
-    return model
+        raise DictionaryError(f"{path}: the expectation is incomplete, or its numbers are no net's")
+    return net
 
 
 def _parse_record(path: Path, number: int, record: object) -> AtomRecord:

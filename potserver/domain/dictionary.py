@@ -10,7 +10,7 @@ from pathlib import Path
 from potserver.domain.atom_file import AtomFile, open_atoms, write_atoms
 from potserver.domain.types import Atom
 from potserver.errors import DictionaryError, UnknownAtomError
-from potserver.numerics.heights import HeightModels
+from potserver.numerics.surroundings import Perceptron
 
 
 class AtomDictionary:
@@ -19,21 +19,21 @@ class AtomDictionary:
     Atoms of a file stay in it until they are asked for, so that thousands of them open at once.
     """
 
-    def __init__(self, atoms: Iterable[Atom] = (), *, heights: HeightModels | None = None) -> None:
+    def __init__(self, atoms: Iterable[Atom] = (), *, expectation: Perceptron | None = None) -> None:
         """Hold atoms.
 
         Args:
             atoms: In order.
-            heights: What the scans that they were chosen from say of heights above the ground; None: nothing.
+            expectation: What the recordings that they were chosen from teach to expect about a scan; None: nothing.
         Raises:
             DictionaryError: two atoms have one id.
         """
         self._slots = _by_id(atoms)
-        self.heights = heights
+        self.expectation = expectation
 
     @classmethod
-    def _of(cls, slots: Iterable[Atom | _StoredAtom], heights: HeightModels | None) -> AtomDictionary:
-        dictionary = cls(heights=heights)
+    def _of(cls, slots: Iterable[Atom | _StoredAtom], expectation: Perceptron | None) -> AtomDictionary:
+        dictionary = cls(expectation=expectation)
         dictionary._slots = _by_id(slots)
         return dictionary
 
@@ -61,7 +61,9 @@ class AtomDictionary:
 
     def of_dims(self, dims: int) -> AtomDictionary:
         """The atoms learned in 2 or in 3 dimensions."""
-        return AtomDictionary._of((slot for slot in self._slots.values() if slot.dims == dims), self.heights)
+        return AtomDictionary._of(
+            (slot for slot in self._slots.values() if slot.dims == dims), self.expectation
+        )
 
     def add(self, atom: Atom) -> AtomDictionary:
         """These atoms and one more, at the end.
@@ -69,7 +71,7 @@ class AtomDictionary:
         Raises:
             DictionaryError: its id is taken.
         """
-        return AtomDictionary._of([*self._slots.values(), atom], self.heights)
+        return AtomDictionary._of([*self._slots.values(), atom], self.expectation)
 
     def remove(self, atom_id: str) -> AtomDictionary:
         """These atoms without one.
@@ -79,7 +81,7 @@ class AtomDictionary:
         """
         leaving = self._slot(atom_id)
         return AtomDictionary._of(
-            (slot for slot in self._slots.values() if slot is not leaving), self.heights
+            (slot for slot in self._slots.values() if slot is not leaving), self.expectation
         )
 
     @staticmethod
@@ -94,7 +96,7 @@ class AtomDictionary:
         Raises:
             DictionaryError: the disk refuses.
         """
-        write_atoms(Path(path), self.atoms, self.heights)
+        write_atoms(Path(path), self.atoms, self.expectation)
 
     @staticmethod
     def load(path: str | os.PathLike[str]) -> AtomDictionary:
@@ -105,7 +107,7 @@ class AtomDictionary:
         """
         file = open_atoms(Path(path))
         return AtomDictionary._of(
-            (_StoredAtom(file, number) for number in range(len(file.records))), file.heights
+            (_StoredAtom(file, number) for number in range(len(file.records))), file.expectation
         )
 
     def _slot(self, atom_id: str) -> Atom | _StoredAtom:

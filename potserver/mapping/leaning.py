@@ -15,16 +15,15 @@ from potschemas.lean import Bytes, to_bytes
 from potserver.domain.tiles import TileGrid, TileIndex
 from potserver.domain.types import Bool, Borrowed, Float64
 from potserver.numerics.beams import Beams, LabelledPoints, beam_weights
-from potserver.numerics.heights import Ground, HeightLabels, HeightModel, HeightModels, ground_of
+from potserver.numerics.ground import LEAST_GROUND, LOWEST_EYE_M, Ground, ground_of
+from potserver.numerics.surroundings import Perceptron, Surroundings
 
-_JUDGED = 4_000  # labelled points, at most
-_EYE_M = (0.3, 5.0)  # heights of a sensor above the ground that the models know
+_JUDGED_BY, _JUDGED = 1_000, 3_000  # beams that tell of labels of the others, labelled points; at most
+_EYE_M = (LOWEST_EYE_M, 5.0)  # heights of a sensor above the ground that are expected
 _STEEPEST = 0.3  # slope of a ground
-_LEAST_GROUND = 6  # cells of a scan's surroundings that lie on one plane
 _SURE_OF_MODEL = 5.0  # precision of the scale about 1
-_LEAST_SCALE = 0.25  # with less of it, the model does not fit here
-_LEAST_SHARE = 0.01  # of a model that is worth naming
-_REACH_M = (-2.0, 6.0)  # heights between which a tile has something to lean on
+_LEAST_SCALE = 0.4  # with less of it, the model does not fit here
+_REACH_M = (-1.5, 6.0)  # heights between which something is expected
 
 NO_MODEL, PLANAR, NO_GROUND, NOVEL = (
     "no_model",
@@ -35,29 +34,23 @@ NO_MODEL, PLANAR, NO_GROUND, NOVEL = (
 
 
 class Expected(NamedTuple):
-    """A height model, placed: what is expected around one scan."""
+    """What is expected around one scan."""
 
-    model: HeightModel
-    ground: Ground  # about `origin`
+    net: Perceptron  # of the dictionary
+    view: Surroundings  # of the scan, about `origin`
     origin: Float64  # (3,) m, map frame: the sensor
-    scale: float  # of the log-odds, in (0, 1]: how well the scan's own labels bear them out
-    shares: tuple[float, ...] = ()  # of the dictionary's models in this one
+    scale: float  # of the log-odds, in (0, 1]: how well they bear out what the scan itself tells
 
     def at(self, points: Float64) -> Float64:
         """(N,) log-odds at (N, 3) points, m, map frame."""
-        about = points - self.origin
-        return self.scale * self.model.at(self.ground.below(about), np.hypot(about[:, 0], about[:, 1]))
+        return self.scale * self.view.expected(points - self.origin, self.net)
 
     @property
     def borrowed(self) -> tuple[Borrowed, ...]:
         """What of the dictionary it is made of, and where that was put."""
-        below = self.origin + np.array([0.0, 0.0, self.ground.height_m])
-        slope = (self.ground.slope_x, self.ground.slope_y)
-        return tuple(
-            Borrowed(f"heights-{number}", share, below, slope, self.scale)
-            for number, share in enumerate(self.shares)
-            if share >= _LEAST_SHARE
-        )
+        ground = self.view.ground
+        below = self.origin + np.array([0.0, 0.0, ground.height_m])
+        return (Borrowed("expectation", 1.0, below, (ground.slope_x, ground.slope_y), self.scale),)
 
 
 class Expectation(NamedTuple):
@@ -68,46 +61,48 @@ class Expectation(NamedTuple):
 
 
 def expect(
-    models: HeightModels | None, beams: Beams, labelled: LabelledPoints, origin: Float64, *, planar: bool
+    net: Perceptron | None, beams: Beams, labelled: LabelledPoints, origin: Float64, *, planar: bool
 ) -> Expectation:
-    """What the dictionary's models say about a scan's surroundings.
+    """What the dictionary says about a scan's surroundings.
 
     Args:
-        models: Of the dictionary; those count most that make the scan's own labels likely.
+        net: Of the dictionary.
         beams: Relative to the sensor, with the map's axes.
-        labelled: Points on them, map frame.
+        labelled: Points on them, map frame: some tell whether what is expected from other beams is true here.
         origin: (3,) m, map frame: the sensor.
         planar: A 2D scan has no heights.
     """
-    if models is None:
+    if net is None:
         return Expectation(None, NO_MODEL)
     if planar:
         return Expectation(None, PLANAR)
     hits = beams.ends[beams.is_return]
-    if len(hits) < _LEAST_GROUND:
+    if len(hits) < LEAST_GROUND:
         return Expectation(None, NO_GROUND)
     ground = ground_of(hits)
     if (
-        ground.n_near < _LEAST_GROUND
+        ground.n_near < LEAST_GROUND
         or np.hypot(ground.slope_x, ground.slope_y) > _STEEPEST
         or not _EYE_M[0] <= -ground.height_m <= _EYE_M[1]
     ):
         return Expectation(None, NO_GROUND)
-    judged = slice(None, None, -(-len(labelled.points) // _JUDGED))
-    about = labelled.points[judged] - origin
-    labels = HeightLabels(
-        ground.below(about),
-        np.hypot(about[:, 0], about[:, 1]),
-        labelled.occupied[judged],
-        beam_weights(labelled)[judged],
-    )
-    shares = models.shares(labels)
-    model = models.mixed(shares)
-    scale = _scale(model.at(labels.height_m, labels.range_m), labels.occupied, labels.weight)
+    scale = _borne_out(net, ground, beams, labelled, origin)
     if scale < _LEAST_SCALE:
         return Expectation(None, NOVEL)
-    place = Expected(model, ground, origin, min(scale, 1.0), tuple(shares.tolist()))
-    return Expectation(place, None)
+    return Expectation(Expected(net, Surroundings.of(beams, ground), origin, min(scale, 1.0)), None)
+
+
+def _borne_out(
+    net: Perceptron, ground: Ground, beams: Beams, labelled: LabelledPoints, origin: Float64
+) -> float:
+    """By how much a few of the beams, half of them at most, foretell the others' labels: 1 if as well as they claim."""
+    n = len(beams.ends)
+    tells = np.arange(n) % max(-(-n // _JUDGED_BY), 2) == 0
+    asked = np.flatnonzero(~tells[labelled.beam])
+    asked = asked[:: max(-(-len(asked) // _JUDGED), 1)]
+    few = Surroundings.of(Beams(beams.ends[tells], beams.is_return[tells]), ground)
+    log_odds = few.expected(labelled.points[asked] - origin, net)
+    return _scale(log_odds, labelled.occupied[asked], beam_weights(labelled)[asked])
 
 
 def _scale(log_odds: Float64, occupied: Bool, weight: Float64) -> float:
@@ -122,16 +117,23 @@ def _scale(log_odds: Float64, occupied: Bool, weight: Float64) -> float:
 
 
 def lean_of_tiles(expected: Expected, tiles: list[TileIndex], grid: TileGrid) -> dict[TileIndex, Bytes]:
-    """The leans of some tiles; those that lie far above or below the ground have none."""
+    """The leans of some tiles; those that lie far above or below the ground have none.
+
+    Nodes beyond the heights that are expected lean as the last ones within.
+    """
     nodes, size = grid.lean_nodes, grid.size_m
     axes = [np.linspace(0.0, size, n) for n in nodes]
-    local = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-    corners = np.array(list(itertools.product((0.0, size), repeat=3)))
+    corners = np.array(list(itertools.product((0.0, size), repeat=2)))
     out = {}
     for index in tiles:
         start = np.asarray(index) * size
-        heights = expected.ground.below(corners + start - expected.origin)
-        if heights.min() < _REACH_M[1] and heights.max() > _REACH_M[0]:
-            log_odds = expected.at(local + start)
-            out[index] = to_bytes(log_odds).reshape(nodes)
+        foot = np.column_stack([corners, np.zeros(4)]) + start
+        above = expected.view.ground.below(foot - expected.origin)  # of the tile's lower corners
+        first, last = np.searchsorted(axes[2], [_REACH_M[0] - above.max(), _REACH_M[1] - above.min()])
+        if first == nodes[2] or last == 0:
+            continue
+        levels = axes[2][first:last]
+        local = np.stack(np.meshgrid(*axes[:2], levels, indexing="ij"), axis=-1).reshape(-1, 3)
+        told = to_bytes(expected.at(local + start)).reshape(*nodes[:2], -1)
+        out[index] = np.pad(told, ((0, 0), (0, 0), (first, nodes[2] - last)), mode="edge")
     return out

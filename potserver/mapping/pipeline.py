@@ -186,7 +186,7 @@ class Pipeline(ABC):
     def expect(self, seen: LabelledScan, carrier: Carrier) -> Expectation:
         """What the dictionary expects around a scan."""
         return expect(
-            carrier.dictionary.heights,
+            carrier.dictionary.expectation,
             seen.beams.learned,
             seen.labelled,
             seen.scan.origin,

@@ -152,7 +152,7 @@ def examples() -> dict[str, m.Message]:
     fitted = msgspec.structs.replace(no_kernels, lean=_lean(), nodes=_nodes())
     borrowed = [
         m.Borrowed(
-            name="heights-2", weight=0.75, displacement=[12.0, -3.5, 0.0], slope=[0.0, 0.015625], scale=1.0
+            name="expectation", weight=0.75, displacement=[12.0, -3.5, 0.0], slope=[0.0, 0.015625], scale=1.0
         )
     ]
     add(msgspec.structs.replace(params, kernels=fitted, sectors=[], borrowed=borrowed), "fitted")

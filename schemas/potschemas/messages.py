@@ -165,7 +165,7 @@ class Kernels(Message, frozen=True, kw_only=True):
 class Borrowed(msgspec.Struct, frozen=True, kw_only=True):
     """A part of the dictionary that the kernels of a scan lean on, and where it was put."""
 
-    name: str  # of a height model: `heights-` and its number in the dictionary
+    name: str  # of what the dictionary gave: `expectation`
     weight: Probability  # share of what is expected: how likely it makes the scan's labels, beside the others
     displacement: Vector3  # m, map frame: where its origin was put, which is the ground below the sensor
     slope: Slope  # of that ground along x and y

@@ -18,7 +18,7 @@ from potserver.domain import atom_file
 from potserver.domain.dictionary import AtomDictionary
 from potserver.domain.types import Atom, KernelSet
 from potserver.errors import DictionaryError, UnknownAtomError
-from potserver.numerics.heights import HeightModels
+from potserver.numerics.surroundings import N_FEATURES, Perceptron
 
 _KERNEL_ARRAYS = [f.name for f in dataclasses.fields(KernelSet)]
 
@@ -106,20 +106,19 @@ def test_the_file_holds_everything(atoms: AtomDictionary, path: Path) -> None:
         assert_equal(before, after)
 
 
-def test_height_models_are_kept_through_files_and_changes(atoms: AtomDictionary, tmp_path: Path) -> None:
-    model = HeightModels(
-        np.array([-1.0, 0.0, 2.5]), np.array([0.0, 9.0]), np.arange(12.0).reshape(2, 3, 2) / 7
-    )
-    changed = AtomDictionary(atoms, heights=model).remove(atoms.atoms[0].atom_id).of_dims(3)
+def test_an_expectation_is_kept_through_files_and_changes(atoms: AtomDictionary, tmp_path: Path) -> None:
+    rng = np.random.default_rng(4)
+    shapes = ((N_FEATURES, 3), (3,), (3, 2), (2,), (2,), (1,))
+    net = Perceptron(*(rng.normal(size=shape).astype(np.float32) for shape in shapes))
+    changed = AtomDictionary(atoms, expectation=net).remove(atoms.atoms[0].atom_id).of_dims(3)
     changed.save(tmp_path / "a.atoms")
-    again = AtomDictionary.load(tmp_path / "a.atoms").heights
+    again = AtomDictionary.load(tmp_path / "a.atoms").expectation
     assert again is not None
-    for one, other in zip(again, model, strict=True):
+    for one, other in zip(again, net, strict=True):
         np.testing.assert_array_equal(one, other)
-    assert atoms.heights is None
-    broken = AtomDictionary(atoms, heights=model._replace(heights_m=np.array([1.0, 0.0, 2.0])))
-    broken.save(tmp_path / "b.atoms")
-    with pytest.raises(DictionaryError, match="height models"):
+    assert atoms.expectation is None
+    AtomDictionary(atoms, expectation=net._replace(first=net.first[1:])).save(tmp_path / "b.atoms")
+    with pytest.raises(DictionaryError, match="expectation"):
         AtomDictionary.load(tmp_path / "b.atoms")
 
 

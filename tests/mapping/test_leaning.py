@@ -13,7 +13,7 @@ from potserver.mapping import leaning
 from potserver.mapping.service import MappingService
 from potserver.recordings import Reader, open_recording, to_scan
 
-HEIGHTS = AtomDictionary((), heights=AtomDictionary.builtin().heights)
+EXPECTING = AtomDictionary((), expectation=AtomDictionary.builtin().expectation)
 
 
 @pytest.fixture(scope="module")
@@ -52,7 +52,7 @@ def labels_of(scan: Scan) -> tuple[np.ndarray, np.ndarray]:
 def test_between_rings_a_leaning_map_is_far_better(street: TownRecording) -> None:
     thin, rest = few_rings(street, 5, 4)
     points, occupied = labels_of(rest)
-    bare, leaning_map = (mapped(d, thin).snapshot.occupancy(points) for d in (AtomDictionary(()), HEIGHTS))
+    bare, leaning_map = (mapped(d, thin).snapshot.occupancy(points) for d in (AtomDictionary(()), EXPECTING))
     without, with_it = (score(a.mean, occupied) for a in (bare, leaning_map))
     assert with_it.nll < 0.6 * without.nll
     assert with_it.ece < without.ece
@@ -64,7 +64,7 @@ def test_between_rings_a_leaning_map_is_far_better(street: TownRecording) -> Non
 def test_evidence_only_borrows_nothing(street: TownRecording) -> None:
     thin, rest = few_rings(street, 5, 2)
     points, _ = labels_of(rest)
-    snapshot = mapped(HEIGHTS, thin).snapshot
+    snapshot = mapped(EXPECTING, thin).snapshot
     answer, own = snapshot.occupancy(points), snapshot.occupancy(points, evidence_only=True)
     assert not own.borrowed.any()
     assert (own.mean[~own.observed] == 0.5).all()
@@ -76,12 +76,12 @@ def test_evidence_only_borrows_nothing(street: TownRecording) -> None:
 def test_with_more_evidence_less_is_borrowed(street: TownRecording) -> None:
     scans = [to_scan(street[i], i) for i in (4, 5, 6)]
     points, _ = labels_of(few_rings(street, 5, 2)[1])
-    shares = [mapped(HEIGHTS, *scans[:n]).snapshot.occupancy(points).borrowed.mean() for n in (1, 3)]
+    shares = [mapped(EXPECTING, *scans[:n]).snapshot.occupancy(points).borrowed.mean() for n in (1, 3)]
     assert shares[1] < shares[0]
 
 
 def test_a_tile_keeps_the_lean_that_its_evidence_began_with(street: TownRecording) -> None:
-    service = mapped(HEIGHTS, to_scan(street[0], 0))
+    service = mapped(EXPECTING, to_scan(street[0], 0))
     assert service.state.tiled is not None
     first = {
         i: t.lean for i, t in service.state.tiled.tiles.items() if t.lean is not None and len(t.rows.kind)
@@ -92,7 +92,7 @@ def test_a_tile_keeps_the_lean_that_its_evidence_began_with(street: TownRecordin
 
 
 def test_forgetting_a_robot_forgets_what_was_expected_about_it(street: TownRecording) -> None:
-    service = mapped(HEIGHTS, to_scan(street[0], 0))
+    service = mapped(EXPECTING, to_scan(street[0], 0))
     service.remove_robot("recording")
     assert service.state.tiled is not None
     assert not service.state.tiled.tiles
@@ -103,10 +103,10 @@ def test_forgetting_a_robot_forgets_what_was_expected_about_it(street: TownRecor
     ("dictionary", "scan", "reason"),
     [
         (AtomDictionary(()), "ground", leaning.NO_MODEL),
-        (HEIGHTS, "planar", leaning.PLANAR),
-        (HEIGHTS, "wall", leaning.NO_GROUND),
-        (HEIGHTS, "grating", leaning.NOVEL),
-        (HEIGHTS, "ground", None),
+        (EXPECTING, "planar", leaning.PLANAR),
+        (EXPECTING, "wall", leaning.NO_GROUND),
+        (EXPECTING, "grating", leaning.NOVEL),
+        (EXPECTING, "ground", None),
     ],
 )
 def test_a_map_says_why_it_does_not_lean(dictionary: AtomDictionary, scan: str, reason: str | None) -> None:

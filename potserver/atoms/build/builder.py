@@ -14,16 +14,16 @@ from potserver.atoms.build.engines import Engine
 from potserver.atoms.build.recipe import Recipe, located
 from potserver.atoms.build.scan_task import Candidate, Progress, ScanResult, ScanTask, learn_scan
 from potserver.atoms.cover import greedy_cover
-from potserver.atoms.heights import learn_heights
+from potserver.atoms.expectation import learn_expectation
 from potserver.domain.dictionary import AtomDictionary
 from potserver.domain.types import Scan
 from potserver.errors import DictionaryError, PotserverError
-from potserver.numerics.heights import HeightModels
+from potserver.numerics.surroundings import Perceptron
 from potserver.recordings import open_recording, to_scan
 
 COVERED = "near a kept atom"
 OVER_LIMIT = "beyond max_atoms"
-_TOLD_BY = 16  # scans of a recording, at most, that heights are learned from
+_TOLD_BY = 28  # scans of a recording, about, that expectations are learned from
 
 
 @dataclasses.dataclass(slots=True)
@@ -136,15 +136,15 @@ def build(
     for dims in (3, 2):
         _choose(recipe, dims, candidates, reports, threads, on_chosen)
     atoms = [candidate.atom for report in reports for candidate in report.kept]
-    return Built(dictionary=AtomDictionary(atoms, heights=heights_of(recipe, tasks)), reports=reports)
+    return Built(dictionary=AtomDictionary(atoms, expectation=expectation_of(recipe, tasks)), reports=reports)
 
 
-def heights_of(recipe: Recipe, tasks: list[ScanTask]) -> HeightModels | None:
-    """What the recordings of tasks say of heights above the ground, by scans from all over each; None if none can tell."""
+def expectation_of(recipe: Recipe, tasks: list[ScanTask]) -> Perceptron | None:
+    """What the recordings of tasks teach to expect, by scans from all over each; None if none can tell."""
     deep = {task.recording: task for task in tasks if task.dims != 2}
     reach = max((task.settings.max_range_m for task in deep.values()), default=0.0)
     scans = (_scans_about(task) for task in deep.values())
-    return learn_heights(scans, max_range_m=reach, seed=recipe.seed)
+    return learn_expectation(scans, max_range_m=reach, seed=recipe.seed)
 
 
 def _scans_about(task: ScanTask) -> Iterator[Scan]:

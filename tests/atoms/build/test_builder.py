@@ -22,7 +22,7 @@ from potschemas import __version__
 from potserver import cli
 from potserver.atoms import learning
 from potserver.atoms.build import scan_task
-from potserver.atoms.build.builder import COVERED, OVER_LIMIT, Built, build, heights_of, scan_tasks
+from potserver.atoms.build.builder import COVERED, OVER_LIMIT, Built, build, expectation_of, scan_tasks
 from potserver.atoms.build.engines import in_order, processes, ray_cluster
 from potserver.atoms.build.recipe import Recipe, parse_recipe
 from potserver.atoms.build.scan_task import NOT_JUDGED, Progress, ScanResult, ScanTask, learn_scan
@@ -30,7 +30,9 @@ from potserver.commands.atoms_build import recipe_of
 from potserver.domain.kernel_map import KernelMap
 from potserver.errors import DictionaryError, SolverError
 from potserver.numerics.geometry import in_sector, rotation_z, yaw_of
-from potserver.numerics.heights import HeightModel
+from potserver.numerics.ground import ground_of
+from potserver.numerics.surroundings import Surroundings
+from potserver.recordings import Reader, open_recording, to_scan
 
 FAST = {"max_kernels": 40, "max_epochs": 3, "max_range_m": 10.0, "max_labelled": 300, "min_hits": 20}
 PLAN = {"dataset": "bundled:plan", "scans": 3, "licence": "MIT", "learner": FAST}
@@ -61,16 +63,17 @@ def first_scan() -> ScanResult:
     return learn_scan(scan_tasks(recipe(seed=5), Path.cwd())[0])
 
 
-def test_a_dictionary_learns_heights_of_its_recordings_that_have_any() -> None:
+def test_a_dictionary_learns_what_to_expect_of_its_recordings_in_3d() -> None:
     street = {"dataset": "town:suburb:vlp16:40m:3", "scans": "0:1", "licence": "MIT", "learner": FAST}
     made = recipe(PLAN, street)
-    heights = heights_of(made, scan_tasks(made, Path.cwd()))
-    assert heights is not None
-    assert heights.log_odds.shape[0] == 1
-    model = HeightModel(heights.heights_m, heights.ranges_m, heights.log_odds[0])
-    below, above = model.at(np.array([-0.1, 0.6]), np.array([6.0, 6.0]))
-    assert below > 2.0 > 0.0 > above
-    assert plan().dictionary.heights is None
+    net = expectation_of(made, scan_tasks(made, Path.cwd()))
+    assert net is not None
+    assert net.is_sound
+    scan = to_scan(open_recording("town:suburb:vlp16:40m:4", Reader(max_range_m=20.0))[3], 0)
+    view = Surroundings.of(scan.beams, ground_of(scan.beams.ends[scan.is_return]))
+    ends = scan.beams.ends[scan.is_return]
+    assert view.expected(ends, net).mean() > 1.0 > -1.0 > view.expected(0.5 * ends, net).mean()
+    assert plan().dictionary.expectation is None
 
 
 # --- one scan -----------------------------------------------------------------------------------------------

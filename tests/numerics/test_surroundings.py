@@ -1,0 +1,80 @@
+"""What a scan shows about a place: features by hand, turned scenes, and the net over them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from potserver.numerics.beams import Beams
+from potserver.numerics.ground import Ground
+from potserver.numerics.surroundings import N_FEATURES, Perceptron, Surroundings
+
+FLOOR = Ground(-1.5, 0.0, 0.0, 100)
+OWN_BEAM, UP_BEAM, OWN_COLUMN, FARTHER_COLUMN = 5, 10, 30, 34  # where their features begin
+
+
+def scene(rng: np.random.Generator, n: int = 400) -> Beams:
+    ends = rng.uniform(-15, 15, (n, 3)) * [1, 1, 0.1]
+    return Beams(ends, rng.random(n) < 0.8)
+
+
+def random_net(rng: np.random.Generator, widths: tuple[int, int] = (32, 32)) -> Perceptron:
+    a, b = widths
+    shapes = ((N_FEATURES, a), (a,), (a, b), (b,), (b,), (1,))
+    return Perceptron(*(rng.normal(size=shape).astype(np.float32) for shape in shapes))
+
+
+def test_a_place_knows_the_beam_through_it_and_what_stands_there() -> None:
+    post = Beams(np.array([[10.0, 0.1, 0.5]]), np.array([True]))
+    view = Surroundings.of(post, FLOOR)
+    before, at, behind = view.features(np.array([[8.0, 0.08, 0.4], [10.0, 0.1, 0.5], [13.0, 0.13, 0.65]]))
+    to_end = [f[OWN_BEAM + 2] for f in (before, at, behind)]
+    assert to_end[0] > 0.6 > 1e-3 > abs(to_end[1])
+    assert to_end[2] < -0.7
+    assert before[OWN_BEAM + 4] == 1.0  # an echo
+    assert (before[UP_BEAM], before[UP_BEAM + 1]) == (1.0, 1.0)  # no beam above
+    assert abs(at[OWN_COLUMN + 1]) < 1e-3
+    assert at[OWN_COLUMN + 2] == pytest.approx(2.0 / 3.0, abs=1e-3)  # 2 m above the ground, of 1 m
+    assert before[FARTHER_COLUMN + 1] == pytest.approx(0.8, abs=0.01)  # 2 m away, of half a metre
+    assert behind[FARTHER_COLUMN + 1] == 0.0  # nothing beyond
+
+
+def test_turning_the_scene_by_cells_changes_nothing() -> None:
+    rng = np.random.default_rng(5)
+    beams, places = scene(rng), rng.uniform(-15, 15, (300, 3)) * [1, 1, 0.1]
+    angle = np.radians(2.0 * 37)  # of so many cells
+    c, s = np.cos(angle), np.sin(angle)
+    turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+    one = Surroundings.of(beams, FLOOR).features(places)
+    other = Surroundings.of(Beams(beams.ends @ turn.T, beams.is_return), FLOOR).features(places @ turn.T)
+    np.testing.assert_allclose(one, other, atol=1e-4)
+
+
+def test_features_are_bounded_wherever_one_asks() -> None:
+    rng = np.random.default_rng(6)
+    places = rng.normal(size=(2000, 3)) * 10.0 ** rng.uniform(-3, 3, (2000, 1))
+    for beams in (scene(rng), Beams(np.zeros((0, 3)), np.zeros(0, bool))):
+        features = Surroundings.of(beams, FLOOR).features(np.concatenate([places, np.zeros((1, 3))]))
+        assert np.isfinite(features).all()
+        assert np.abs(features).max() <= 1.5
+
+
+@pytest.mark.parametrize("widths", [(32, 32), (5, 3)])
+def test_the_net_is_two_layers_of_rectified_sums(widths: tuple[int, int]) -> None:
+    rng = np.random.default_rng(7)
+    view, net = Surroundings.of(scene(rng), FLOOR), random_net(rng, widths)
+    places = rng.uniform(-15, 15, (301, 3))
+    x = view.features(places).astype(np.float64)
+    one = np.maximum(x @ net.first + net.first_bias, 0)
+    two = np.maximum(one @ net.second + net.second_bias, 0)
+    np.testing.assert_allclose(
+        view.expected(places, net), two @ net.last + net.last_bias, rtol=1e-4, atol=1e-3
+    )
+    assert len(view.expected(places[:0], net)) == 0
+
+
+def test_a_net_of_other_features_is_not_sound() -> None:
+    net = random_net(np.random.default_rng(8))
+    assert net.is_sound
+    assert not net._replace(first=net.first[1:]).is_sound
+    assert not net._replace(last_bias=np.array([np.nan], np.float32)).is_sound
