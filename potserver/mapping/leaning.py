@@ -46,11 +46,16 @@ class Expected(NamedTuple):
         return self.scale * self.view.expected(points - self.origin, self.net)
 
     @property
+    def ground(self) -> Ground:
+        """Below the scan, about `origin`."""
+        return self.view.ground
+
+    @property
     def borrowed(self) -> tuple[Borrowed, ...]:
         """What of the dictionary it is made of, and where that was put."""
-        ground = self.view.ground
-        below = self.origin + np.array([0.0, 0.0, ground.height_m])
-        return (Borrowed("expectation", 1.0, below, (ground.slope_x, ground.slope_y), self.scale),)
+        below = self.origin + np.array([0.0, 0.0, self.ground.height_m])
+        slope = (self.ground.slope_x, self.ground.slope_y)
+        return (Borrowed("expectation", 1.0, below, slope, self.scale),)
 
 
 class Expectation(NamedTuple):
