@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from potserver.numerics.arrays import Float64
+from potserver.numerics.geometry import voxel_pick
 
 LEAST_GROUND = 6  # cells of a scan's surroundings that lie on one plane
 LOWEST_EYE_M = 0.3  # above it: a sensor on the ground itself tells nothing about heights
@@ -37,11 +38,8 @@ def ground_of(hits: Float64) -> Ground:
     Args:
         hits: (N, 3) m, N > 0, the sensor as origin, z up.
     """
-    cell = np.floor(hits[:, :2] / _CELL_M).astype(np.int64)
-    order = np.lexsort((hits[:, 2], cell[:, 0], cell[:, 1]))
-    is_first = np.ones(len(order), bool)
-    is_first[1:] = (np.diff(cell[order], axis=0) != 0).any(axis=1)
-    lowest = hits[order[is_first]]
+    upwards = hits[np.argsort(hits[:, 2], kind="stable")]
+    lowest = upwards[voxel_pick(upwards * (1.0, 1.0, 0.0), _CELL_M)]
     z, A = lowest[:, 2], np.column_stack([np.ones(len(lowest)), lowest[:, :2]])
     slack = len(lowest) * _FLAT_M**2 * 100.0
     ridge = np.diag([1e-6, slack, slack])
