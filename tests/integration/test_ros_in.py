@@ -369,4 +369,7 @@ def test_a_ros_robot_scores_as_the_same_scans_published(stranger: Callable) -> N
                 until(lambda n=i: server.mapper("ros").n_scans == n + 1, "the scan")
             ends = np.concatenate([scan.in_map[::20] for scan in scans])
             with MapClient(server.endpoint, map="ros", timeout_s=DEADLINE_S) as over_ros:
-                assert np.allclose(over_ros.occupancy(ends).mean, direct.occupancy(ends).mean, atol=0.02)
+                off = np.abs(over_ros.occupancy(ends).mean - direct.occupancy(ends).mean)
+                # ROS rounds points to float32: a beam on the edge of a cell may lie beside it then
+                assert np.quantile(off, 0.99) < 0.02
+                assert off.mean() < 0.002
