@@ -190,7 +190,9 @@ class TilesPlan(Plan[TileRun]):
                 codes = code_tile(tile.kernels.kernels, self.spacings_m, self.tile_size_m, coding.steps)
                 codes = codes._replace(lean=tile.lean)
                 coding.memory.put(key, codes)
-            changes.append(Change(codes, coding.bases[t]))
+            base = coding.bases[t]
+            # of a base without kernels the asker holds a lean, and no tile that nodes could change
+            changes.append(Change(codes, base if base is not None and base.n_kernels else None))
         return self._run(i, members, [c.codes.others for c in changes])._replace(changes=tuple(changes))
 
     def _run(self, i: int, members: Sequence[int], kernels: list[KernelSet]) -> TileRun:

@@ -14,6 +14,7 @@ import pytest
 
 from potclient import KernelSet, MapClient
 from potclient.cli import main
+from potclient.datasets import open_dataset
 from potclient.errors import NoServerError, UsageError
 from potschemas import messages, wire
 from potschemas.messages import ErrorCode
@@ -128,14 +129,6 @@ def test_a_map_that_leans_is_mirrored_with_its_lean(site: Site) -> None:
         there = site.client.occupancy(points, with_gradient=True)
         short.update()  # leans that it has come no more
         brief = short.occupancy(points)
-        off = np.abs(brief.mean - there.mean)[brief.observed == there.observed]
-        print(
-            n,
-            x,
-            off.max(),
-            np.quantile(off, [0.9, 0.99]),
-            (np.abs(brief.borrowed - there.borrowed) < 0.05).mean(),
-        )
         assert (np.abs(brief.borrowed - there.borrowed) < 0.05).mean() > 0.97
         here = mirror.occupancy(points, gradient=True)
         assert (there.borrowed > 0.5).mean() > 0.1
@@ -161,6 +154,23 @@ def test_a_map_that_leans_is_mirrored_with_its_lean(site: Site) -> None:
     np.testing.assert_allclose(cells.borrowed.ravel(), asked.borrowed, atol=1e-4)
     bare = site.client.grid([30, -4, -2], [34, 4, 0], 0.5, evidence_only=True)
     assert not bare.borrowed.any()
+
+
+def test_tiles_that_only_leant_get_their_kernels_later(site: Site) -> None:
+    """Of such a tile the asker holds no nodes that could change."""
+    mirror, drive = site.client.mirror(), open_dataset("town:terraces", max_range_m=25.0)
+    mapper: Any = site.server.mapper("default")
+    only_leant: set[tuple[int, int, int]] = set()
+    grew = 0
+    for k in range(0, 100, 20):
+        scan = drive[k]
+        site.client.integrate(scan.points, scan.T_map_sensor, is_return=scan.is_return)
+        mirror.update()
+        tiles = site.server.mapper("default").state.tiled.tiles
+        grew += sum(len(tiles[index].kernels) > 0 for index in only_leant)
+        only_leant = {index for index, tile in tiles.items() if not len(tile.kernels)}
+    assert grew > 0
+    assert len(mirror.kernels) == sum(len(tile.kernels) for tile in tiles.values())
 
 
 def test_a_box_is_mirrored_so_that_answers_in_it_are_the_map_s(site: Site) -> None:
