@@ -13,7 +13,7 @@ from potschemas.lean import LeanTiles, to_bytes
 from potserver.domain.tiles import COARSE_SPACING, TileIndex
 from potserver.domain.types import Bool, Float32, Float64, KernelSet, OwnMap
 from potserver.errors import SolverError
-from potserver.mapping.leaning import Expected
+from potserver.mapping.leaning import EVERY, Expected
 from potserver.mapping.placing import kernels_at
 from potserver.mapping.refinement import LabelledRows, rows_of
 from potserver.numerics.beams import Beams, label_beams
@@ -34,7 +34,6 @@ _SOLVER = Solver(n_newton=5, n_conjugate_gradient=8, longest_step=4.0, least_cur
 _SUPPORT_OF_NOTHING = 0.05  # of a kernel; with so much support its variance is half the prior's
 _WORTH_OF_HIT = 0.25  # of a row, beside one of free space, whose voxel has eight times the volume
 _LEAN_TILE_M, _LEAN_NODES = 10.0, (3, 3, 41)  # the kernels make up for what a coarse lean smooths over
-_LEAN_STEP = 0xF8  # mask of a byte: every eighth step
 
 
 def fitted_map(
@@ -121,7 +120,7 @@ def _lean_of(expected: Expected, points: Float64) -> LeanTiles:
     axes = [np.linspace(0.0, _LEAN_TILE_M, n) for n in _LEAN_NODES]
     local = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
     log_odds = expected.at((tiles[:, None] * _LEAN_TILE_M + local).reshape(-1, 3))
-    told = (to_bytes(log_odds) & _LEAN_STEP).reshape(-1, *_LEAN_NODES)
+    told = (to_bytes(log_odds, EVERY)).reshape(-1, *_LEAN_NODES)
     index: list[TileIndex] = [(x, y, z) for x, y, z in tiles.tolist()]
     return LeanTiles(_LEAN_TILE_M, dict(zip(index, told, strict=True)))
 

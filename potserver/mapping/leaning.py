@@ -26,6 +26,7 @@ _LEAST_SCALE = 0.4  # with less of it, the model does not fit here
 _REACH_M = (-1.5, 6.0)  # heights between which something is expected
 
 EXPECTATION = "expectation"  # the name of what a dictionary expects
+EVERY = 8  # steps of half a log-odd: they travel, and kernels make up for what is rounded off
 NO_MODEL, PLANAR, NO_GROUND, NOVEL = (
     "no_model",
     "planar",
@@ -139,6 +140,6 @@ def lean_of_tiles(expected: Expected, tiles: list[TileIndex], grid: TileGrid) ->
             continue
         levels = axes[2][first:last]
         local = np.stack(np.meshgrid(*axes[:2], levels, indexing="ij"), axis=-1).reshape(-1, 3)
-        told = to_bytes(expected.at(local + start)).reshape(*nodes[:2], -1)
+        told = to_bytes(expected.at(local + start), EVERY).reshape(*nodes[:2], -1)
         out[index] = np.pad(told, ((0, 0), (0, 0), (first, nodes[2] - last)), mode="edge")
     return out

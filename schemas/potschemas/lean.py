@@ -42,9 +42,10 @@ class LeanAt(NamedTuple):
     gradient: Float32  # (N, 3) log-odds/m; 0 where there is none
 
 
-def to_bytes(log_odds: Float) -> Bytes:
-    """The nearest steps to log-odds, cut off at `MAX_LEAN`."""
-    steps = np.rint(np.clip(log_odds, -MAX_LEAN, MAX_LEAN) / LEAN_UNIT)
+def to_bytes(log_odds: Float, every: int = 1) -> Bytes:
+    """The nearest steps to log-odds, cut off at `MAX_LEAN`; of those that are multiples of `every`, which deflate better."""
+    steps = np.rint(np.clip(log_odds, -MAX_LEAN, MAX_LEAN) / (every * LEAN_UNIT)) * every
+    steps = np.clip(steps, -127, 127)
     told: Bytes = (steps + LEAN_ZERO).astype(np.uint8)
     return told
 

@@ -166,7 +166,7 @@ def test_tiles_that_only_leant_get_their_kernels_later(site: Site) -> None:
         scan = drive[k]
         site.client.integrate(scan.points, scan.T_map_sensor, is_return=scan.is_return)
         mirror.update()
-        tiles = site.server.mapper("default").state.tiled.tiles
+        tiles = mapper.state.tiled.tiles
         grew += sum(len(tiles[index].kernels) > 0 for index in only_leant)
         only_leant = {index for index, tile in tiles.items() if not len(tile.kernels)}
     assert grew > 0
