@@ -36,6 +36,7 @@ _PART = (
 FREE = ""  # in the list of robots: a number that belongs to nobody
 _ROW_BYTES, _KERNEL_BYTES = 31, 122  # of a row; of a kernel in its tile and ready to be asked
 LEAN_M, LEAN_LEVEL_M = 1.0, 0.25  # between the nodes of a lean, across and upwards, about
+_FORMER_LEAN_M = 2.5
 _MOST_LEAN_CELLS = 127  # of a tile along an axis
 _VOXELS_OF_PAIR = 5  # two coarse cells are five fine ones: the least length that every lattice divides
 
@@ -154,8 +155,16 @@ class TileGrid(NamedTuple):
     @property
     def lean_nodes(self) -> tuple[int, int, int]:
         """Nodes of a tile's lean along x, y and z, from corner to corner."""
+        return self._lean_nodes(LEAN_M)
+
+    @property
+    def former_lean_nodes(self) -> tuple[int, int, int]:
+        """The same in maps that were kept when leans were known in fewer places."""
+        return self._lean_nodes(_FORMER_LEAN_M)
+
+    def _lean_nodes(self, step_m: float) -> tuple[int, int, int]:
         across, up = (
-            min(max(round(self.size_m / step), 1), _MOST_LEAN_CELLS) + 1 for step in (LEAN_M, LEAN_LEVEL_M)
+            min(max(round(self.size_m / step), 1), _MOST_LEAN_CELLS) + 1 for step in (step_m, LEAN_LEVEL_M)
         )
         return across, across, up
 

@@ -95,6 +95,18 @@ class Lean:
         return out
 
 
+def resampled(nodes: UInt8, shape: tuple[int, int, int]) -> UInt8:
+    """A tile's lean, (X, Y, Z) bytes, as nodes of another lattice from corner to corner: interpolated as answers are."""
+    found = nodes.astype(np.float64)
+    for axis, n in enumerate(shape):
+        at = np.linspace(0.0, nodes.shape[axis] - 1.0, n)
+        low = np.minimum(at.astype(np.int64), nodes.shape[axis] - 2)
+        share = np.expand_dims(at - low, [a for a in range(3) if a != axis])
+        found = np.take(found, low, axis) * (1.0 - share) + np.take(found, low + 1, axis) * share
+    out: UInt8 = np.rint(found).astype(np.uint8)
+    return out
+
+
 def _address(array: NDArray[Any]) -> int:
     return int(array.__array_interface__["data"][0])
 

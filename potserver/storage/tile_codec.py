@@ -20,6 +20,7 @@ from potserver.domain.tiles import CARRIED, MapKernels, Tile, TileGrid, TileInde
 from potserver.domain.types import KERNEL_ARRAYS, KernelSet
 from potserver.errors import MapFileError, ShapeError
 from potserver.numerics.evidence import KINDS, Rows
+from potserver.numerics.lean import resampled
 from potserver.storage.seal import sealed, unsealed
 
 _HEAD = struct.Struct("<3i2q2I")  # index, revision, stamp_ns, rows, kernels
@@ -106,7 +107,9 @@ def decode_tile(data: bytes, grid: TileGrid, n_robots: int) -> tuple[TileIndex, 
             ),
             revision,
             stamp_ns,
-            lean,
+            resampled(lean, grid.lean_nodes)
+            if lean is not None and lean.shape == grid.former_lean_nodes
+            else lean,
         )
     except (zlib.error, ShapeError) as error:
         raise MapFileError(f"tile {(x, y, z)}: {error}", reason="damaged") from error

@@ -106,6 +106,15 @@ def test_a_cut_off_tile_is_noticed(n: int) -> None:
         decode_tile(data[: n % len(data)], GRID, 3)
 
 
+def test_a_lean_that_was_kept_in_fewer_places_is_read() -> None:
+    grid = TileGrid.of(10.0, 0.4)
+    x, y, z = np.meshgrid(*(np.linspace(0, 1, n) for n in grid.former_lean_nodes), indexing="ij")
+    former = np.rint(128 + 60 * x - 40 * y + 20 * z).astype(np.uint8)
+    _, tile = decode_tile(encode_tile((0, 0, 0), make_tile(0, 0)._replace(lean=former)), grid, 3)
+    x, y, z = np.meshgrid(*(np.linspace(0, 1, n) for n in grid.lean_nodes), indexing="ij")
+    np.testing.assert_allclose(tile.lean, 128 + 60 * x - 40 * y + 20 * z, atol=1.01)
+
+
 def _with(tile: Tile, **rows: Any) -> Tile:
     return tile._replace(rows=tile.rows._replace(**rows))
 
