@@ -60,12 +60,12 @@ def learn_expectation(
         upright = [scan for scan in scans if not scan.is_planar]
         beams = [limit_range(scan.beams, 0.0, max_range_m) for scan in upright]
         for i, scan in enumerate(upright):
-            after = [
-                Beams(b.ends + s.origin - scan.origin, b.is_return)
-                for b, s in zip(beams[i + 1 : i + 1 + _LATER], upright[i + 1 : i + 1 + _LATER], strict=True)
+            after = slice(i + 1, i + 1 + _LATER)
+            later = [
+                (Beams(b.ends + s.origin - scan.origin, b.is_return), s.origin - scan.origin)
+                for b, s in zip(beams[after], upright[after], strict=True)
             ]
-            eyes = [s.origin - scan.origin for s in upright[i + 1 : i + 1 + _LATER]]
-            lessons += _lessons_of(beams[i], list(zip(after, eyes, strict=True)), max_range_m, rng)
+            lessons += _lessons_of(beams[i], later, max_range_m, rng)
     if not lessons:
         return None
     with one_torch_thread():
@@ -89,14 +89,14 @@ def _lessons_of(
     out = []
     for seen in chosen:
         drawn = rng.permutation(np.flatnonzero(seen))[:_SEEN]
-        view = Beams(beams.ends[drawn], beams.is_return[drawn])
+        view = beams.take(drawn)
         hits = view.ends[view.is_return]
         if len(hits) < LEAST_GROUND:
             continue
         ground = ground_of(hits)
         if -ground.height_m < LOWEST_EYE_M:
             continue
-        others = [(Beams(beams.ends[~seen], beams.is_return[~seen]), np.zeros(3)), *later]
+        others = [(beams.take(~seen), np.zeros(3)), *later]
         places = [_places(asked, eye, rng) for asked, eye in others if len(asked.ends)]
         if not places:
             continue

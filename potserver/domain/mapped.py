@@ -29,9 +29,8 @@ _RECORD = 24
 _AT_ADDRESS = 16  # bytes before the address in siginfo_t
 
 _lock = threading.Lock()
-_table = np.zeros(
-    (_MOST, _RECORD // 8), np.int64
-)  # the handler reads it: where each lies, and whether a page of it is lost
+# The handler reads it: where each lies, and whether a page of it is lost.
+_table = np.zeros((_MOST, _RECORD // 8), np.int64)
 _free = list(range(_MOST))[::-1]
 
 

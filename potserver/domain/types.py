@@ -24,9 +24,7 @@ class ParamsKind(str, Enum):
     """Which kernels a scan's sender gets back."""
 
     FITTED = "fitted"  # solved on the scan's labels, beyond what the dictionary expects there
-    TRANSPORTED = (
-        "transported"  # of the nearest atoms, carried by optimal transport and refined by the labels
-    )
+    TRANSPORTED = "transported"  # of the nearest atoms: carried by transport, refined by the labels
     NONE = "none"  # none are computed
 
 

@@ -11,13 +11,14 @@ import numpy as np
 from potschemas.answers import PRIOR_VAR
 from potschemas.lean import LeanTiles, to_bytes
 from potserver.domain.tiles import COARSE_SPACING, TileIndex
-from potserver.domain.types import Bool, Float32, Float64, KernelSet, OwnMap
+from potserver.domain.types import Float32, Float64, KernelSet, OwnMap
 from potserver.errors import SolverError
 from potserver.mapping.leaning import EVERY, Expected
 from potserver.mapping.placing import kernels_at
 from potserver.mapping.refinement import LabelledRows, rows_of
+from potserver.mapping.support import support_of
 from potserver.numerics.beams import Beams, label_beams
-from potserver.numerics.feature_blocks import Blocks, feature_blocks, two_diagonals
+from potserver.numerics.feature_blocks import feature_blocks
 from potserver.numerics.geometry import bounds
 from potserver.numerics.lattice_nodes import new_nodes
 from potserver.numerics.lean import Lean
@@ -31,8 +32,6 @@ _COARSE_REACH, _FINE_REACH = 0.7, 0.9  # spacings: nearer nodes than this get a 
 _SPARSE, _MANY = 4, 18_000  # of many rows every fourth asks for coarse kernels, which hundreds of rows share
 _CUT = 0.1  # activations below this are left out of the solve
 _SOLVER = Solver(n_newton=5, n_conjugate_gradient=8, longest_step=4.0, least_curvature=0.003)
-_SUPPORT_OF_NOTHING = 0.05  # of a kernel; with so much support its variance is half the prior's
-_WORTH_OF_HIT = 0.25  # of a row, beside one of free space, whose voxel has eight times the volume
 _LEAN_TILE_M, _LEAN_NODES = 10.0, (3, 3, 41)  # the kernels make up for what a coarse lean smooths over
 
 
@@ -96,7 +95,7 @@ def _thinned(beams: Beams, rng: np.random.Generator) -> Beams:
     if n <= _BEAMS:
         return beams
     drawn = np.sort(rng.choice(n, _BEAMS, replace=False))
-    return Beams(beams.ends[drawn], beams.is_return[drawn])
+    return beams.take(drawn)
 
 
 def _kernels_on(rows: LabelledRows, fine_m: float, planar: bool) -> KernelSet:
@@ -120,7 +119,7 @@ def _lean_of(expected: Expected, points: Float64) -> LeanTiles:
     axes = [np.linspace(0.0, _LEAN_TILE_M, n) for n in _LEAN_NODES]
     local = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
     log_odds = expected.at((tiles[:, None] * _LEAN_TILE_M + local).reshape(-1, 3))
-    told = (to_bytes(log_odds, EVERY)).reshape(-1, *_LEAN_NODES)
+    told = to_bytes(log_odds, EVERY).reshape(-1, *_LEAN_NODES)
     index: list[TileIndex] = [(x, y, z) for x, y, z in tiles.tolist()]
     return LeanTiles(_LEAN_TILE_M, dict(zip(index, told, strict=True)))
 
@@ -137,20 +136,11 @@ def _solved(
         rows.points, kernels.hinge_mean, kernels.gamma, edge_m=edge_m, cut=_CUT, bytes_a_value=1, threads=threads
     )  # fmt: skip
     prior = Prior(kernels.weight_mean, kernels.weight_var, offset)
-    fit = warm_fit(
-        blocks, rows.occupied, rows.counts, prior, kernels.weight_mean, _SOLVER, threads=threads
-    )  # fmt: skip
+    fit = warm_fit(blocks, rows.occupied, rows.counts, prior, kernels.weight_mean, _SOLVER, threads=threads)
     if not np.isfinite(fit.weights).all():
         raise SolverError(
             f"the weights of {len(kernels)} kernels on {len(rows.points)} rows came out NaN or infinite"
         )
-    var = _variance(blocks, rows.occupied, rows.counts, threads)
+    support = support_of(blocks, rows.occupied.astype(np.uint8), rows.counts, threads)
+    var = support.variance(kernels.weight_var)
     return kernels.replace(weight_mean=fit.weights, weight_var=var), fit.converged
-
-
-def _variance(blocks: Blocks, occupied: Bool, counts: Float32, threads: int) -> Float32:
-    """(K,) log-odds^2: the prior's where nothing was seen, and the less the more was, as in the overall map."""
-    worth = np.minimum(counts, 1.0) * np.where(occupied, _WORTH_OF_HIT, 1.0)
-    worth = worth[blocks.order].astype(np.float32)
-    seen, _ = two_diagonals(blocks, worth, np.zeros_like(worth), threads=threads)
-    return np.float32(PRIOR_VAR * _SUPPORT_OF_NOTHING) / (np.float32(_SUPPORT_OF_NOTHING) + seen)

@@ -25,17 +25,17 @@ from potserver.domain.tiles import (
     part_of,
     tiles_of_part,
 )
-from potserver.domain.types import Bool, Float32, Float64, KernelSet
+from potserver.domain.types import Bool, Float64, KernelSet
 from potserver.errors import SolverError
 from potserver.mapping.leaning import Expected, lean_of_tiles
 from potserver.mapping.placing import activation, gamma_of_spacing, kernels_at
 from potserver.mapping.refinement import FEATURE_CUT
 from potserver.mapping.settings import MappingSettings
+from potserver.mapping.support import support_of
 from potserver.mapping.surfaces import FACE_SAMPLES, FaceSamples, Samples, faces_of, surface_samples
 from potserver.numerics import evidence
-from potserver.numerics.arrays import UInt8
 from potserver.numerics.beams import Beams, LabelledPoints, beam_weights
-from potserver.numerics.feature_blocks import Blocks, feature_blocks, two_diagonals
+from potserver.numerics.feature_blocks import feature_blocks
 from potserver.numerics.geometry import bounds, inside_box
 from potserver.numerics.lattice_nodes import new_nodes
 from potserver.numerics.warm_fit import Prior, Solver, warm_fit
@@ -48,8 +48,6 @@ _LONGEST_STEP = 4.0  # Newton steps
 _UNSUPPORTED = 1e-5  # of a kernel's curvature: what no row within its reach leaves
 _STALE = 0.125  # half-lives after which a tile that no scan touches is fitted again
 _MEMORY = 200.0  # looks that one place remembers; older ones give way
-_SUPPORT_OF_NOTHING = 0.05  # of a kernel; with so much support its variance is half the prior's
-_WORTH_OF_HALF = 0.25  # of a row in a voxel of half the resolution, which has an eighth of the volume
 _SATURATION = 20.0  # looks at one place that count in a solve; further ones repeat them
 _CHEAP_VALUES = 60_000_000  # features that a solve may touch for more Newton steps than it must take
 
@@ -322,35 +320,6 @@ def _fits_budget(present: Float64, added: Float64, grid: TileGrid, limit: int) -
     return place[len(present) :] < limit
 
 
-class _Support(NamedTuple):
-    """How much evidence stands behind each of K kernels."""
-
-    seen: Float32  # (K,) sum over seen rows of their worth times phi^2
-    unseen: Float32  # (K,) the same over shadows
-
-    def variance(self, prior_var: Float32) -> Float32:
-        """(K,) log-odds^2: the prior's where nothing was seen, and the less the more was.
-
-        The curvature of the loss would do for a wide posterior. Here labels part cleanly: sure rows have no curvature, and
-        those of one look would leave a kernel as uncertain as those of none.
-        """
-        unseen = self.unseen + np.float32(_SUPPORT_OF_NOTHING)
-        return prior_var * unseen / (unseen + self.seen)
-
-
-def _support_of(blocks: Blocks, kind: UInt8, counts: Float32, threads: int) -> _Support:
-    """The support of a block's kernels by rows of these kinds and counts."""
-    is_shadow = kind == evidence.SHADOW
-    worth = np.minimum(counts, np.float32(1.0)) * np.where(
-        kind & 1, np.float32(_WORTH_OF_HALF), np.float32(1.0)
-    )
-    seen, unseen = (
-        weight[blocks.order].astype(np.float32)
-        for weight in (np.where(is_shadow, np.float32(0), worth), is_shadow & (counts > 0))
-    )
-    return _Support(*two_diagonals(blocks, seen, unseen, threads=threads))
-
-
 def _fit(region: Region, lower: Float64, upper: Float64, options: FusionOptions, threads: int) -> bool:
     """Solve the weights of the kernels in a box, those around it held; whether the solve went well.
 
@@ -392,7 +361,7 @@ def _fit(region: Region, lower: Float64, upper: Float64, options: FusionOptions,
         raise SolverError(f"the weights of {len(local)} kernels on {len(rows)} rows came out NaN or infinite")
     mean, var = kernels.weight_mean.copy(), kernels.weight_var.copy()
     solved = local[free]
-    support = _support_of(blocks, region.rows.kind[rows], counts, threads)
+    support = support_of(blocks, region.rows.kind[rows], counts, threads)
     mean[solved] = fit.weights[free]
     var[solved] = support.variance(region.kernels.prior_var[local])[free]
     keep = np.ones(len(kernels), bool)

@@ -106,7 +106,7 @@ def _borne_out(
     tells = np.arange(n) % max(-(-n // _JUDGED_BY), 2) == 0
     asked = np.flatnonzero(~tells[labelled.beam])
     asked = asked[:: max(-(-len(asked) // _JUDGED), 1)]
-    few = Surroundings.of(Beams(beams.ends[tells], beams.is_return[tells]), ground)
+    few = Surroundings.of(beams.take(tells), ground)
     log_odds = few.expected(labelled.points[asked] - origin, net)
     return _scale(log_odds, labelled.occupied[asked], beam_weights(labelled)[asked])
 
@@ -134,7 +134,7 @@ def lean_of_tiles(expected: Expected, tiles: list[TileIndex], grid: TileGrid) ->
     for index in tiles:
         start = np.asarray(index) * size
         foot = np.column_stack([corners, np.zeros(4)]) + start
-        above = expected.view.ground.below(foot - expected.origin)  # of the tile's lower corners
+        above = expected.ground.below(foot - expected.origin)  # of the tile's lower corners
         first, last = np.searchsorted(axes[2], [_REACH_M[0] - above.max(), _REACH_M[1] - above.min()])
         if first == nodes[2] or last == 0:
             continue

@@ -36,9 +36,7 @@ class Draws(NamedTuple):
     learn: np.random.Generator
     check: np.random.Generator
     surface: np.random.Generator
-    own: (
-        np.random.Generator
-    )  # of the scan's own map: whatever its sender asks for, the overall map is the same
+    own: np.random.Generator  # of the scan's own map: what its sender asks for never changes the overall map
 
     @staticmethod
     def of(seed: int, n_scans: int) -> Draws:
@@ -70,10 +68,7 @@ def draw_beams(scan: Scan, limits: BeamLimits, draws: Draws) -> DrawnBeams:
     is_checked = draws.check.random(len(drawn)) < min(limits.check_share, _MOST_CHECKED / len(drawn))
     is_checked[0] &= not is_checked.all()  # something must be learned
     beams = cut_range(scan.beams_at(drawn), limits.max_range_m)
-    return DrawnBeams(
-        Beams(beams.ends[~is_checked], beams.is_return[~is_checked]),
-        Beams(beams.ends[is_checked], beams.is_return[is_checked]),
-    )
+    return DrawnBeams(beams.take(~is_checked), beams.take(is_checked))
 
 
 def thin_beams(labelled: LabelledPoints, n_beams: int, limit: int, draws: Draws) -> LabelledPoints:

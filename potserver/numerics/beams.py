@@ -24,11 +24,15 @@ class Beams(NamedTuple):
     ends: Float64  # (N, 3) m, relative to the start
     is_return: Bool  # (N,) false = no echo: free up to the end
 
+    def take(self, index: Int64 | Bool) -> Beams:
+        """The beams that a numpy index picks."""
+        return Beams(self.ends[index], self.is_return[index])
+
 
 def limit_range(beams: Beams, min_range_m: float, max_range_m: float) -> Beams:
     """Leave out beams shorter than `min_range_m`; cut longer ones than `max_range_m`, which then end without an echo."""
     keep = long_enough(beams.ends, min_range_m)
-    return cut_range(Beams(beams.ends[keep], beams.is_return[keep]), max_range_m)
+    return cut_range(beams.take(keep), max_range_m)
 
 
 def long_enough(ends: Floats, min_range_m: float) -> Int64:
