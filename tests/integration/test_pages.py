@@ -16,7 +16,7 @@ from potschemas import messages, wire
 from potserver.config import load_settings
 from potserver.server import MapServer
 
-from .conftest import Client, drain, make_cloud
+from .conftest import Client, drain, make_cloud, until
 
 POINTS = np.random.default_rng(0).uniform([-8, -7, -2], [128, 7, 3], (500, 3))
 PLACES_M = (0.0, 40.0, 80.0, 120.0, 1.0, 41.0)
@@ -112,7 +112,9 @@ def test_pages_that_the_disk_refuses_stay_in_memory(tmp_path: Path, monkeypatch:
         site = Site(stack, tmp_path / "store", limits__max_resident_bytes=1)
         monkeypatch.setattr("potserver.domain.pages.os.pwrite", refuse)
         site.drive()
-        assert site.client.stats().counters["store.pages_failed"] == len(PLACES_M)
+        until(  # a scan's receipt is sent before its pages
+            lambda: site.client.stats().counters["store.pages_failed"] == len(PLACES_M), "refused pages"
+        )
         assert site.client.info().n_scans == len(PLACES_M)
         monkeypatch.undo()
         answer = site.client.occupancy(POINTS)
