@@ -95,7 +95,7 @@ class Tiles:
             map_revision=state.map_revision,
             rule=state.snapshot.rule,
             tile_size_m=size,
-            spacings_m=() if tiled is None else (tiled.grid.coarse_m, tiled.grid.fine_m),
+            spacings_m=() if tiled is None else tiled.grid.spacings_m,
             is_whole=is_whole,
             tiles=changed,
             gone=np.array([i for i in revisions if i not in present], np.int64).reshape(-1, 3),

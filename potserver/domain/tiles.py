@@ -20,7 +20,7 @@ from potserver.domain.types import Bool, Float32, Float64, KernelSet
 from potserver.errors import MapFullError, OutOfRangeError, SettingsError, ShapeError
 from potserver.numerics.arrays import UInt8
 from potserver.numerics.bricks import Part
-from potserver.numerics.evidence import Cells, Rows, cells, decay, is_alive, tile_of
+from potserver.numerics.evidence import SCALES, Cells, Rows, cells, decay, is_alive, tile_of
 from potserver.numerics.grouping import by_number
 from potserver.numerics.lean import Lean
 from potserver.numerics.threads import parallel_map
@@ -52,7 +52,7 @@ class MapKernels:
     """
 
     kernels: KernelSet  # weights as fitted last
-    level: NDArray[np.int8]  # (K,) COARSE, FINE or CARRIED
+    level: NDArray[np.int8]  # (K,) COARSE, FINE, CARRIED, or above: see `level_of`
     prior_mean: Float32  # (K,) log-odds
     prior_var: Float32  # (K,) log-odds^2, > 0
 
@@ -98,6 +98,16 @@ class MapKernels:
             prior_mean=kernels.weight_mean,
             prior_var=kernels.weight_var,
         )
+
+
+def level_of(scale: int) -> int:
+    """The level of the kernels about hits of a scale: a lattice of the resolution / 2^scale."""
+    return CARRIED + scale if scale else FINE
+
+
+def scale_of(level: NDArray[np.int8]) -> NDArray[np.int8]:
+    """(K,) the scale that kernels of these levels are of; 0 of the coarse and the carried ones."""
+    return np.maximum(level - CARRIED, 0).astype(np.int8)
 
 
 class Tile(NamedTuple):
@@ -146,6 +156,11 @@ class TileGrid(NamedTuple):
     def coarse_m(self) -> float:
         """Spacing of the coarse kernels."""
         return COARSE_SPACING * self.fine_m
+
+    @property
+    def spacings_m(self) -> tuple[float, ...]:
+        """Of all lattices, the coarsest first."""
+        return (self.coarse_m, *(self.fine_m / 2**scale for scale in range(SCALES)))
 
     @property
     def voxels(self) -> int:
@@ -361,9 +376,9 @@ class Region:
 
         Rows of one cell lie together, so that the next scan has to look for each cell once.
         """
-        number, n_cells = self.cells or cells(self.rows)
+        of_row = self.cells or cells(self.rows)
         alive = np.flatnonzero(is_alive(self.rows))
-        by_cell = alive[by_number(number[alive], n_cells)[0]]
+        by_cell = alive[by_number(of_row.number[alive], of_row.n)[0]]
         rows = self.rows.take(by_cell)
         tile, voxel = tile_of(rows, self.grid.voxels, size)
         order, cuts = by_number(tile, int(size.prod()))
@@ -394,4 +409,4 @@ class Region:
 
 def voxels_along(rows: Rows, grid: TileGrid) -> NDArray[np.int64]:
     """(R, 1) voxels along a tile's edge, for each row in the voxels of its kind."""
-    return np.where(rows.is_half, 2 * grid.voxels, grid.voxels)[:, None]
+    return np.asarray(grid.voxels << rows.halvings.astype(np.int64), np.int64)[:, None]

@@ -104,7 +104,7 @@ def _solve(region: Region, lower: Float64, upper: Float64, solver: Solver, *, th
         where[rows], hinge[local], near.kernels.gamma, edge_m=_CUBE_M, cut=FEATURE_CUT, bytes_a_value=1, threads=threads
     )  # fmt: skip
     fit = warm_fit(
-        blocks, evidence.LABELS[region.rows.kind[rows]], counts[rows], Prior(near.prior_mean, near.prior_var),
+        blocks, evidence.LABELS[region.rows.sort[rows]], counts[rows], Prior(near.prior_mean, near.prior_var),
         near.kernels.weight_mean, solver, free=free, threads=threads,
     )  # fmt: skip
     if not (np.isfinite(fit.weights).all() and np.isfinite(fit.var).all()):

@@ -80,7 +80,7 @@ def merge(
                 for r, c in zip(rows, corners - origin, strict=True)
             ]
         )
-        data = evidence.Rows.concatenate(rows)
+        data = evidence.Rows.concatenate(rows).rescaled(theirs.grid.fine_m / ours.grid.fine_m)
         kernels = MapKernels.concatenate(
             [theirs.tiles[i].kernels.moved(c) for i, c in zip(inside, corners - origin, strict=True)]
         )

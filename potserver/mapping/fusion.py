@@ -15,14 +15,15 @@ from potschemas.answers import PRIOR_VAR
 from potserver.domain.tiles import (
     CARRIED,
     COARSE,
-    FINE,
     MapKernels,
     Region,
     Tile,
     TiledMap,
     TileGrid,
     TileIndex,
+    level_of,
     part_of,
+    scale_of,
     tiles_of_part,
 )
 from potserver.domain.types import Bool, Float64, KernelSet
@@ -32,15 +33,17 @@ from potserver.mapping.placing import activation, gamma_of_spacing, kernels_at
 from potserver.mapping.refinement import FEATURE_CUT
 from potserver.mapping.settings import MappingSettings
 from potserver.mapping.support import support_of
-from potserver.mapping.surfaces import FACE_SAMPLES, FaceSamples, Samples, faces_of, surface_samples
+from potserver.mapping.surfaces import FACE_SAMPLES, FaceSamples, Samples, hits_of, surface_samples
 from potserver.numerics import evidence
 from potserver.numerics.beams import Beams, LabelledPoints, beam_weights
+from potserver.numerics.evidence import FREE, HIT, kind_of
 from potserver.numerics.feature_blocks import feature_blocks
 from potserver.numerics.geometry import bounds, inside_box
 from potserver.numerics.lattice_nodes import new_nodes
 from potserver.numerics.warm_fit import Prior, Solver, warm_fit
 
 _FINEST_M, _COARSEST_M, _FINE_PER_RANGE = 0.2, 0.4, 1.0 / 20.0
+_DETAIL_M = 0.1  # the finest kernels, about hits that lie closely
 _COARSE_REACH = 0.7  # spacings: nearer coarse nodes than this get a kernel, see lattice_nodes.new_nodes
 _FINE_REACH = 0.9  # the same for fine nodes about hits, so that faces have nodes on both sides
 _EXPLAINED = 1.0  # activation by carried kernels at which the lattice adds none
@@ -69,6 +72,7 @@ class FusionOptions:
 
     gone_odds: float
     max_kernels_per_tile: int
+    detail_m: float  # spacing of the finest kernels
     effort: FitEffort = SCAN_EFFORT
     faces: FaceSamples = FACE_SAMPLES
 
@@ -80,9 +84,14 @@ class FusionOptions:
         return FusionOptions(
             gone_odds=settings.gone_odds,
             max_kernels_per_tile=settings.max_kernels_per_tile,
+            detail_m=settings.resolution_m or _DETAIL_M,
             effort=effort,
             faces=faces,
         )
+
+    def scales_of(self, grid: TileGrid) -> int:
+        """How many scales a map of this grid has: its resolution is halved as long as it stays at `detail_m` or above."""
+        return int(np.clip(1 + np.floor(np.log2(grid.fine_m / self.detail_m) + 1e-6), 1, evidence.SCALES))
 
 
 class Look(NamedTuple):
@@ -175,19 +184,20 @@ def fuse(
 def _samples_of(look: Look, region: Region, options: FusionOptions, threads: int) -> Samples:
     """All that a scan says; rows of hits that have left, as its beams see through their place, are emptied in place."""
     grid, start = region.grid, look.origin - region.origin_m
-    labelled = look.labelled
-    parts = [
-        Samples(labelled.points - region.origin_m, labelled.occupied.astype(np.uint8), beam_weights(labelled))
-    ]
+    labelled, beams = look.labelled, look.beams
     known = region.rows.take(region.rows.occupied & evidence.is_alive(region.rows))
     where = evidence.positions(known, grid.fine_m)
-    faces = faces_of(look.beams, start, where, 0.5 * grid.fine_m, planar=look.is_planar)
+    hits = hits_of(beams, start, where, grid.fine_m, options.scales_of(grid), planar=look.is_planar)
+    scale = np.zeros(len(beams.ends), np.uint8)
+    scale[beams.is_return] = hits.scale
+    kind = np.where(labelled.occupied, kind_of(HIT, scale[labelled.beam]), np.uint8(FREE))
+    parts = [Samples(labelled.points - region.origin_m, kind, beam_weights(labelled))]
     if options.gone_odds:
         seen = evidence.see_through(
-            region.rows, look.beams, faces, start, fine_m=grid.fine_m, odds=options.gone_odds, threads=threads
+            region.rows, beams, hits.faces, start, fine_m=grid.fine_m, odds=options.gone_odds, threads=threads
         )
         parts.append(Samples(*seen))
-    parts.append(surface_samples(look.beams, start, faces, options.faces, look.rng))
+    parts.append(surface_samples(hits, start, options.faces, look.rng))
     return Samples.concatenate(parts)
 
 
@@ -265,7 +275,7 @@ def add_evidence(
     evidence.forget(rows, gained, cells, _MEMORY)
     region.rows, region.cells = rows, cells
     new = rows.take(slice(n_old, None))
-    return new.take(new.kind <= evidence.HIT)
+    return new.take(new.sort <= evidence.HIT)
 
 
 def add_kernels(
@@ -281,16 +291,14 @@ def add_kernels(
     asking = evidence.positions(new_rows, grid.fine_m)
     parts = [taken]
     from_atoms = KernelSet.concatenate([present.kernels.take(present.level == CARRIED), taken.kernels])
-    for level, spacing, within in ((COARSE, grid.coarse_m, _COARSE_REACH), (FINE, grid.fine_m, _FINE_REACH)):
+    lattices = [(COARSE, grid.coarse_m, asking, _COARSE_REACH)]
+    for scale in range(evidence.SCALES):  # finer kernels stand on those of the scale below
+        hits = asking[new_rows.occupied & (new_rows.scale >= scale)]
+        lattices.append((level_of(scale), grid.fine_m / 2**scale, hits, _FINE_REACH))
+    for level, spacing, asked, within in lattices:
         there = present.kernels.hinge_mean[present.level == level]
-        nodes = new_nodes(
-            asking if level == COARSE else asking[new_rows.occupied],
-            there,
-            spacing,
-            within=within,
-            planar=planar,
-        )
-        same_scale = from_atoms.take(_is_fine(from_atoms, grid) == (level == FINE))
+        nodes = new_nodes(asked, there, spacing, within=within, planar=planar)
+        same_scale = from_atoms.take(_is_fine(from_atoms, grid) == (level != COARSE))
         if len(same_scale) and len(nodes):
             nodes = nodes[activation(same_scale, nodes, threads=threads) < _EXPLAINED]
         parts.append(MapKernels.new(kernels_at(nodes, spacing, PRIOR_VAR), level))
@@ -354,14 +362,15 @@ def _fit(region: Region, lower: Float64, upper: Float64, options: FusionOptions,
         region.lean_at(where[rows], threads),
     )
     fit = warm_fit(
-        blocks, evidence.LABELS[region.rows.kind[rows]], counts, prior, kernels.weight_mean[local],
+        blocks, evidence.LABELS[region.rows.sort[rows]], counts, prior, kernels.weight_mean[local],
         Solver(n_newton, effort.gradient_steps, _LONGEST_STEP), free=free, threads=threads,
     )  # fmt: skip
     if not (np.isfinite(fit.weights).all() and np.isfinite(fit.var).all()):
         raise SolverError(f"the weights of {len(local)} kernels on {len(rows)} rows came out NaN or infinite")
     mean, var = kernels.weight_mean.copy(), kernels.weight_var.copy()
     solved = local[free]
-    support = support_of(blocks, region.rows.kind[rows], counts, threads)
+    scale = scale_of(region.kernels.level[local])
+    support = support_of(blocks, region.rows.kind[rows], counts, threads, scale)
     mean[solved] = fit.weights[free]
     var[solved] = support.variance(region.kernels.prior_var[local])[free]
     keep = np.ones(len(kernels), bool)

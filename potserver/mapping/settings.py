@@ -25,13 +25,15 @@ class MappingSettings:
 
     # resolution and storage
     resolution_m: Annotated[
-        float, "spacing of fine kernels; 0: a 20th of the first scan's median range, 0.2 to 0.4 m"
+        float,
+        "spacing of fine kernels; 0: a 20th of the first scan's median range, 0.2 to 0.4 m, and down to 0.1 m"
+        " about hits that lie closely",
     ] = 0.0
     tile_size_m: Annotated[float, "edge of a tile, the unit of storage and of change notices"] = 10.0
 
     # budgets
     beams_per_scan: Annotated[int, "of a denser scan, so many beams are drawn"] = 30_000
-    max_kernels_per_tile: Annotated[int, "further kernels of a full tile are left out"] = 8_000
+    max_kernels_per_tile: Annotated[int, "further kernels of a full tile are left out"] = 16_000
 
     # forgetting
     gone_odds: Annotated[

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from potserver.domain.types import Float32
 from potserver.numerics import evidence
@@ -12,7 +13,7 @@ from potserver.numerics.arrays import UInt8
 from potserver.numerics.feature_blocks import Blocks, two_diagonals
 
 _SUPPORT_OF_NOTHING = 0.05  # of a kernel; with so much support its variance is half the prior's
-_WORTH_OF_HALF = 0.25  # of a row in a voxel of half the resolution, which has an eighth of the volume
+_WORTH_OF_HALF = 0.25  # of a row in a voxel of half the edge, which has an eighth of the volume
 
 
 class Support(NamedTuple):
@@ -31,14 +32,18 @@ class Support(NamedTuple):
         return prior_var * unseen / (unseen + self.seen)
 
 
-def support_of(blocks: Blocks, kind: UInt8, counts: Float32, threads: int) -> Support:
-    """The support of a block's kernels by rows of these kinds and counts."""
-    is_shadow = kind == evidence.SHADOW
-    worth = np.minimum(counts, np.float32(1.0)) * np.where(
-        kind & 1, np.float32(_WORTH_OF_HALF), np.float32(1.0)
-    )
+def support_of(
+    blocks: Blocks, kind: UInt8, counts: Float32, threads: int, scale: NDArray[np.int8] | None = None
+) -> Support:
+    """The support of a block's kernels by rows of these kinds and counts; by default all kernels are of scale 0."""
+    is_shadow = kind & evidence.KIND_MASK == evidence.SHADOW
+    worth = np.minimum(counts, np.float32(1.0)) * np.float32(_WORTH_OF_HALF) ** evidence.halvings_of(kind)
     seen, unseen = (
         weight[blocks.order].astype(np.float32)
         for weight in (np.where(is_shadow, np.float32(0), worth), is_shadow & (counts > 0))
     )
-    return Support(*two_diagonals(blocks, seen, unseen, threads=threads))
+    support = Support(*two_diagonals(blocks, seen, unseen, threads=threads))
+    if scale is None:
+        return support
+    narrower = np.float32(1.0 / _WORTH_OF_HALF) ** scale  # they reach as many rows of their own scale
+    return Support(support.seen * narrower, support.unseen * narrower)

@@ -10,9 +10,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from potserver.numerics import evidence, surface
+from potserver.numerics import surface
 from potserver.numerics.arrays import Bool, Float32, Float64, UInt8
 from potserver.numerics.beams import Beams
+from potserver.numerics.detail import angles_between, scales_of
+from potserver.numerics.evidence import NEAR, SHADOW, kind_of
+
+_NORMAL_VOXELS = 0.5  # resolutions: hits that lie so near to each other share a normal
+_LEAST_COSINE = 0.1  # of incidence: below it beams lie as far apart as there
+# Voxels of hits are no finer than the beams and the noise: two beams end on each, and its edge is so many standard deviations.
+_VOXEL_OF_BEAMS, _VOXEL_OF_NOISE = 1.4, 8.0
 
 
 class FaceSamples(NamedTuple):
@@ -45,46 +52,59 @@ class Samples(NamedTuple):
         return Samples(*(np.concatenate(parts) for parts in zip(*sets, strict=True)))
 
 
-def faces_of(
-    beams: Beams, origin: Float64, known: Float64, voxel_m: float, *, planar: bool
-) -> surface.Normals:
-    """The faces that a scan's H hits lie on.
+class Hits(NamedTuple):
+    """The H hits of a scan."""
+
+    ends: Float64  # (H, 3) m, relative to the beams' start
+    faces: surface.Normals  # that they lie on
+    scale: UInt8  # (H,) how often the map's resolution is halved for them
+
+
+def hits_of(
+    beams: Beams, origin: Float64, known: Float64, fine_m: float, n_scales: int, *, planar: bool
+) -> Hits:
+    """The hits of a scan, the faces that they lie on, and the detail that they show.
 
     Args:
         beams: Relative to `origin`.
         origin: (3,) m, in the region's frame.
         known: (R, 3) m, hit rows of the map there: the scan alone may be too sparse to show how a face lies.
-        voxel_m: Edge of the voxels whose hits share a normal.
+        fine_m: The map's resolution.
+        n_scales: That the map has.
         planar: Faces are upright, as seen by a planar sensor.
     """
     ends = beams.ends[beams.is_return]
-    rays = ends / np.linalg.norm(ends, axis=1, keepdims=True)
-    return surface.normals(ends, rays, known - origin, voxel_m, planar=planar)
+    length = np.linalg.norm(ends, axis=1)
+    faces = surface.normals(
+        ends, ends / length[:, None], known - origin, _NORMAL_VOXELS * fine_m, planar=planar
+    )
+    apart_m = angles_between(beams.ends, planar=planar)[beams.is_return] * length
+    shown_m = np.maximum(
+        _VOXEL_OF_BEAMS * apart_m / np.maximum(faces.cosine, _LEAST_COSINE), _VOXEL_OF_NOISE * faces.sigma_m
+    )
+    return Hits(ends, faces, scales_of(shown_m, fine_m, n_scales))
 
 
-def surface_samples(
-    beams: Beams, origin: Float64, faces: surface.Normals, how: FaceSamples, rng: np.random.Generator
-) -> Samples:
-    """Near samples and shadows of a scan's hits.
+def surface_samples(hits: Hits, origin: Float64, how: FaceSamples, rng: np.random.Generator) -> Samples:
+    """Near samples and shadows of a scan's hits, as fine as these.
 
     Args:
-        beams: Relative to `origin`.
+        hits: Relative to `origin`.
         origin: (3,) m, in the region's frame.
-        faces: Of the hits.
         how: Clearances, depths and weights.
         rng: Of the draws.
     """
-    ends = beams.ends[beams.is_return]
+    ends, faces, scale = hits
     if len(ends) == 0:
         return Samples(np.zeros((0, 3)), np.zeros(0, np.uint8), np.zeros(0))
     low, high = how.near_m
-    near, _ = surface.near_free(
+    near, of_hit = surface.near_free(
         ends, np.zeros(3), faces, low_m=low, high_m=high, sigmas=how.near_sigmas, rng=rng
     )
     low, high = how.shadow_m
     shadow = surface.behind(ends, faces, low_m=low, high_m=high, rng=rng)
     return Samples(
         np.concatenate([near, shadow]) + origin,
-        np.repeat(np.array([evidence.NEAR, evidence.SHADOW], np.uint8), [len(near), len(shadow)]),
+        np.concatenate([kind_of(NEAR, scale[of_hit]), kind_of(SHADOW, scale)]),
         np.repeat([how.near_weight, 1.0], [len(near), len(shadow)]),
     )

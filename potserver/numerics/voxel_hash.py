@@ -32,6 +32,13 @@ def pack(kind, x, y, z):
 
 
 @nb.njit(nogil=True, error_model="numpy", cache=True)
+def unpack(key):
+    """What a key was packed from: the kind and three cell numbers."""
+    bias, mask = np.int64(1 << 19), np.int64((1 << 20) - 1)
+    return key >> 60, ((key >> 40) & mask) - bias, ((key >> 20) & mask) - bias, (key & mask) - bias
+
+
+@nb.njit(nogil=True, error_model="numpy", cache=True)
 def find(table, keys, key):
     """Where in the table the key is, or the free place where it would be entered."""
     mask = len(table) - 1

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from potserver.domain.tiles import CARRIED, MapKernels, Tile, TileGrid, TileIndex, voxels_along
 from potserver.domain.types import KERNEL_ARRAYS, KernelSet
 from potserver.errors import MapFileError, ShapeError
-from potserver.numerics.evidence import KINDS, Rows
+from potserver.numerics.evidence import KINDS, SCALES, Rows
 from potserver.numerics.lean import resampled
 from potserver.storage.seal import sealed, unsealed
 
@@ -123,10 +123,11 @@ def _check(tile: Tile, grid: TileGrid, n_robots: int, index: TileIndex) -> None:
     edge = voxels_along(rows, grid)
     sound = (
         ((rows.voxel >= 0) & (rows.voxel < edge)).all()
-        and np.isin(rows.kind, KINDS).all()
+        and np.isin(rows.sort, KINDS).all()
+        and (rows.scale < SCALES).all()
         and np.isfinite(rows.sums).all()
         and ((rows.source >= 0) & (rows.source < n_robots)).all()
-        and ((kernels.level >= 0) & (kernels.level <= CARRIED)).all()
+        and ((kernels.level >= 0) & (kernels.level < CARRIED + SCALES)).all()
         and np.isfinite(kernels.prior_mean).all()
         and (np.isfinite(kernels.prior_var) & (kernels.prior_var > 0)).all()
         and (tile.lean is None or tile.lean.shape == grid.lean_nodes)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from potserver.domain.dictionary import AtomDictionary
+from potserver.domain.tiles import level_of
 from potserver.domain.types import Scan, yaw_pose
 from potserver.mapping.service import MappingService
 from potserver.mapping.settings import MappingSettings
@@ -49,6 +50,51 @@ def test_a_wall_stands_where_it_is(distance_m: float) -> None:
     for k in range(5):
         service.integrate(wall(distance_m, seed=k))
     assert abs(crossing_m(service, distance_m)) <= 0.10
+
+
+def opening(seed: int) -> Scan:
+    """A wall 3 m away with a slit of .4 m in it, and a wall 2 m behind."""
+    rng = np.random.default_rng(seed)
+    azimuth, elevation = (
+        x.ravel() for x in np.meshgrid(np.arange(-0.6, 0.6, 0.004), np.arange(-0.2, 0.2, 0.01))
+    )
+    azimuth += rng.uniform(0, 0.004)
+    ray = np.stack(
+        [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)], axis=1
+    )
+    is_open = np.abs(3.0 / ray[:, 0] * ray[:, 1]) < 0.2
+    range_m = np.where(is_open, 5.0, 3.0) / ray[:, 0] + rng.normal(0, 0.01, len(ray))
+    return Scan(points=ray * range_m[:, None], T_map_sensor=np.eye(4))
+
+
+def free_width_m(service: MappingService) -> float:
+    """Of the slit, where p is below one half."""
+    y = np.linspace(-0.6, 0.6, 601)
+    lines = [
+        service.snapshot.occupancy(np.column_stack([np.full(601, 3.03), y, np.full(601, z)])).mean
+        for z in (-0.2, 0.0, 0.2)
+    ]
+    return float((np.mean(lines, axis=0) < 0.5).mean() * 1.2)
+
+
+def test_a_map_that_began_far_outside_is_fine_where_beams_lie_closely() -> None:
+    """The first scan alone would make kernels of .4 m everywhere."""
+    follows, coarse = mapper(), mapper(resolution_m=0.4)
+    for service in (follows, coarse):
+        service.integrate(wall(20.0))
+        for k in range(5):
+            service.integrate(opening(k))
+    assert follows.state.tiled.grid == coarse.state.tiled.grid
+    assert follows.state.tiled.grid.fine_m == 0.4
+    finest = {
+        name: max(
+            int(tile.kernels.level.max()) for tile in service.state.tiled.tiles.values() if len(tile.kernels)
+        )
+        for name, service in (("follows", follows), ("coarse", coarse))
+    }
+    assert finest == {"follows": level_of(2), "coarse": level_of(0)}
+    assert free_width_m(coarse) == 0.0
+    assert 0.25 < free_width_m(follows) <= 0.4
 
 
 def test_behind_a_wall_nothing_is_known() -> None:
@@ -146,7 +192,7 @@ def test_the_rows_beside_faces_are_of_the_robot_that_saw_them() -> None:
     service = mapper()
     for robot, seed in (("a", 1), ("b", 2)):
         service.integrate(dataclasses.replace(wall(5.0, seed=seed), robot_id=robot))
-    kinds = {int(k) for tile in service.state.tiled.tiles.values() for k in tile.rows.kind}
+    kinds = {int(k) for tile in service.state.tiled.tiles.values() for k in tile.rows.sort}
     assert kinds >= {evidence.FREE, evidence.HIT, evidence.SHADOW, evidence.NEAR}
     service.remove_robot("b")
     alone = mapper()

@@ -8,7 +8,16 @@ import numba as nb
 import numpy as np
 
 from potserver.numerics.arrays import Bool, Float32, Float64, UInt8
-from potserver.numerics.evidence.rows import FREE, HIT, Cells, Rows, fill
+from potserver.numerics.evidence.rows import (
+    FREE,
+    HIT,
+    KIND_MASK,
+    SCALE_SHIFT,
+    Cells,
+    Rows,
+    fill,
+    halvings,
+)
 from potserver.numerics.flag_grid import FlagGrid, may_be_around
 from potserver.numerics.voxel_hash import find, pack
 
@@ -20,7 +29,7 @@ _BESIDE_IN_THE_CLEAR = 1.0  # a new free row, no hits in the voxels around
 _AWAY_IN_THE_CLEAR = 3.0  # the same, two voxels away
 _OLD_FREE = 10.0  # an old free row: much heavier neighbours show that it is noise
 _BESIDE_HITS = 25.0  # a new free row beside hits, and every row of hits: surfaces need their detail
-_CLEAR = 1  # voxels around a free row without hits, for it to join a row beside it
+_CLEAR = 1  # voxels of the resolution around a free row without hits, for it to join a row beside it
 _WIDE_CLEAR = 3  # the same, to join a row two voxels away
 
 
@@ -74,54 +83,55 @@ def add_sparing(
     first, last = np.floor(lower / fine_m).astype(np.int64) + 1, np.floor(upper / fine_m).astype(np.int64) - 1
     # the part shifts with every round, so that a source that has every third turn gets to all parts too
     part = (turn + turn // TURNS) % TURNS
-    hits = FlagGrid.of(added.rows.voxel[added.rows.occupied] >> 1)
+    is_hit = np.flatnonzero(added.rows.occupied)
+    places = added.rows.voxel[is_hit] >> added.rows.halvings[is_hit, None]
+    hits, wide = FlagGrid.of(places), FlagGrid.of(places, 1)
     _join_light(
-        added.rows, added.weight, left, n_before, source, fine_m, first, last, part, added.places, added.n_cells, hits
-    )  # fmt: skip
-    cells = Cells(added.places.number[left], added.n_cells)
+        added.rows, added.weight, left, n_before, source, fine_m, first, last, part, added.places, hits, wide
+    )
+    cells = Cells.of(added.places, added.n_cells)
+    cells = cells._replace(number=cells.number[left])
     return Joined(added.rows.take(left), added.weight[left], int(left[:n_before].sum()), cells)
 
 
 @nb.njit(nogil=True, error_model="numpy", cache=True)
-def _join_light(rows, gained, left, n_old, source, fine_m, first, last, part, index, n_cells, hits):
+def _join_light(rows, gained, left, n_old, source, fine_m, first, last, part, index, hits, wide):
     """Join rows, in place; `left` says afterwards which are left. Old ones join only in voxels from `first` to `last`.
 
     Args:
         rows, gained, n_old, source, fine_m: See `add_sparing`; the rows have the samples.
-        index, n_cells: Of the rows.
-        hits: Cells with hits in them, of any source.
+        index: Of the rows.
+        hits: Voxels of the resolution with hits in them, of any source and scale. Where they are flagged in blocks, fewer rows
+            join.
+        wide: The same in blocks, which are looked up faster.
     """
     voxel, kind, sums, sources = rows
-    has_hit = np.zeros(n_cells, np.bool_)
-    for r in range(len(kind)):
-        if kind[r] == HIT:
-            has_hit[index.number[r]] = True
+    place = np.empty(3, np.int64)
     for r in range(len(kind)):
         w = sums[r, 3]
         is_old = r < n_old
-        is_hit = kind[r] == HIT
-        if not (is_hit or kind[r] == FREE) or not 0.0 < w <= (_STILL_LIGHT if is_old else _LIGHT):
+        sort = kind[r] & KIND_MASK
+        is_hit = sort == HIT
+        if not (is_hit or sort == FREE) or not 0.0 < w <= (_STILL_LIGHT if is_old else _LIGHT):
             continue
         if is_old:
             if sources[r] != source or (voxel[r, 0] + 2 * voxel[r, 1] + 3 * voxel[r, 2]) % TURNS != part:
                 continue
-            if not _is_between(voxel[r], 1 if is_hit else 0, first, last):
+            if not _is_between(voxel[r], halvings(kind[r]), first, last):
                 continue
-        edge = 0.5 * fine_m if is_hit else fine_m
-        if not is_hit and has_hit[index.number[r]]:
+        edge = fine_m / (1 << halvings(kind[r]))
+        for c in range(3):
+            place[c] = voxel[r, c] >> halvings(kind[r])
+        if not is_hit and may_be_around(hits, place, 0):
             continue
         factor = _BESIDE_HITS
         if not is_hit:
             if is_old:
                 factor = _OLD_FREE
-            elif not _any_hits(voxel[r], _CLEAR, hits, has_hit, index):
+            elif not may_be_around(hits, place, _CLEAR):
                 factor = _BESIDE_IN_THE_CLEAR
         to = _nearest_around(rows, left, edge, r, 1, factor * w, index)
-        if (
-            to < 0
-            and factor == _BESIDE_IN_THE_CLEAR
-            and not _any_hits(voxel[r], _WIDE_CLEAR, hits, has_hit, index)
-        ):
+        if to < 0 and factor == _BESIDE_IN_THE_CLEAR and not may_be_around(wide, place, _WIDE_CLEAR):
             to = _nearest_around(rows, left, edge, r, 2, _AWAY_IN_THE_CLEAR * w, index)
         if to < 0:
             continue
@@ -133,25 +143,8 @@ def _join_light(rows, gained, left, n_old, source, fine_m, first, last, part, in
 
 
 @nb.njit(nogil=True, error_model="numpy", cache=True)
-def _any_hits(cell, reach, hits, has_hit, index):
-    """Whether a cell, or one at most `reach` cells from it along each axis, has hits."""
-    if not may_be_around(hits, cell, reach):
-        return False
-    if hits.shift == 0:
-        return True  # the flags are of cells
-    keys, table = index.keys, index.table
-    for dx in range(-reach, reach + 1):
-        for dy in range(-reach, reach + 1):
-            for dz in range(-reach, reach + 1):
-                other = table[find(table, keys, pack(0, cell[0] + dx, cell[1] + dy, cell[2] + dz))]
-                if other >= 0 and has_hit[other]:
-                    return True
-    return False
-
-
-@nb.njit(nogil=True, error_model="numpy", cache=True)
 def _is_between(voxel, shift, first, last):
-    """Whether a voxel, whose edge is that of free space / 2^shift, lies in a box of voxels of free space."""
+    """Whether a voxel, whose edge is the resolution / 2^shift, lies in a box of voxels of the resolution."""
     for c in range(3):
         v = voxel[c] >> shift
         if v < first[c] or v > last[c]:
@@ -164,14 +157,14 @@ def _nearest_around(rows, left, edge, r, reach, least_weight, index):
     """Of the other rows of its kind and source within `reach` voxels of row r, the nearest of at least such weight; or -1."""
     voxel, kind, sums, sources = rows
     _, following, head, keys, table = index
-    shift = np.int64(kind[r] & 1)
+    shift, scale = np.int64(kind[r] & 1), kind[r] >> SCALE_SHIFT
     x, y, z = np.int64(voxel[r, 0]), np.int64(voxel[r, 1]), np.int64(voxel[r, 2])
     nearest = np.int64(-1)
     least = np.inf
     for cx in range((x - reach) >> shift, ((x + reach) >> shift) + 1):
         for cy in range((y - reach) >> shift, ((y + reach) >> shift) + 1):
             for cz in range((z - reach) >> shift, ((z + reach) >> shift) + 1):
-                cell = table[find(table, keys, pack(0, cx, cy, cz))]
+                cell = table[find(table, keys, pack(scale, cx, cy, cz))]
                 if cell < 0:
                     continue
                 q = head[cell]

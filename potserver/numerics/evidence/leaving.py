@@ -29,7 +29,17 @@ import numpy as np
 
 from potserver.numerics.arrays import Float64, Int32, Int64, UInt8
 from potserver.numerics.beams import Beams
-from potserver.numerics.evidence.rows import FREE, HIT, MISSED, PASSED, Rows, is_alive, positions
+from potserver.numerics.evidence.rows import (
+    FREE,
+    HIT,
+    KIND_MASK,
+    MISSED,
+    PASSED,
+    SCALE_SHIFT,
+    Rows,
+    is_alive,
+    positions,
+)
 from potserver.numerics.flag_grid import FlagGrid
 from potserver.numerics.surface import Normals
 from potserver.numerics.threads import parallel_map, spans
@@ -141,7 +151,7 @@ def see_through(
     ends = beams.ends + origin
     echoes = _Echoes.of(ends[beams.is_return], faces, fine_m)
     known = rows.take(hit_rows)
-    voxel = np.concatenate([echoes.hits.voxel, known.voxel])
+    voxel = np.concatenate([echoes.hits.voxel, known.voxel >> known.scale[:, None]])
     if len(voxel) == 0 or len(ends) == 0:
         return SeenThrough.nothing()
     hits = _Hits.of(voxel, np.concatenate([echoes.hits.at, positions(known, fine_m)]))
@@ -238,15 +248,17 @@ def _tallies(voxel, kind, weight, table, keys):
     of_row = np.full(len(kind), -1, np.int64)
     hits, passed, missed = np.zeros(len(keys)), np.zeros(len(keys)), np.zeros(len(keys))
     for r in range(len(kind)):
-        if not (kind[r] == HIT or kind[r] == PASSED or kind[r] == MISSED):
+        sort, scale = kind[r] & KIND_MASK, kind[r] >> SCALE_SHIFT
+        if sort not in (HIT, PASSED, MISSED):
             continue
-        number = table[find(table, keys, pack(1, voxel[r, 0], voxel[r, 1], voxel[r, 2]))]
+        key = pack(1, voxel[r, 0] >> scale, voxel[r, 1] >> scale, voxel[r, 2] >> scale)
+        number = table[find(table, keys, key)]
         of_row[r] = number
         if number < 0:
             continue
-        if kind[r] == HIT:
+        if sort == HIT:
             hits[number] += weight[r]
-        elif kind[r] == PASSED:
+        elif sort == PASSED:
             passed[number] += weight[r]
         else:
             missed[number] += weight[r]

@@ -15,6 +15,7 @@ All functions are pure but for `forget`, which scales sums in place.
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numba as nb
@@ -22,11 +23,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potserver.numerics.arrays import Bool, Float32, Float64, Int16, Int32, Int64, UInt8
-from potserver.numerics.voxel_hash import empty_table, enter, find, pack
+from potserver.numerics.voxel_hash import empty_table, enter, find, pack, unpack
 
-FREE, HIT, SHADOW, NEAR = 0, 1, 2, 3  # kinds; the odd ones have voxels of half the resolution
+FREE, HIT, SHADOW, NEAR = 0, 1, 2, 3  # kinds; the odd ones have voxels of half the edge
 PASSED, MISSED = 5, 7
 KINDS = (FREE, HIT, SHADOW, NEAR, PASSED, MISSED)
+SCALES = 3  # a row of scale s has voxels of the resolution / 2^s: beams that lie closely see more detail
+SCALE_SHIFT = 3  # a row's kind is that of its sample, one of `KINDS`, and its scale from this bit on
+KIND_MASK = 2**SCALE_SHIFT - 1
 # of the kinds: the share of occupied looks that they stand for
 LABELS = np.full(8, np.nan, np.float32)
 LABELS[[FREE, HIT, SHADOW, NEAR]] = 0.0, 1.0, 0.5, 0.0
@@ -37,11 +41,21 @@ _LEAST_WEIGHT = 1e-3  # a row with less is taken for empty
 _INSIDE = 0.5 - 1e-6  # voxels: how far from the centre a row may stand
 
 
+def kind_of(sort: int, scale: UInt8) -> UInt8:
+    """(N,) the kinds of rows of a sort, one of `KINDS`, and these scales."""
+    return np.uint8(sort) + (scale << np.uint8(SCALE_SHIFT))
+
+
+def halvings_of(kind: UInt8) -> UInt8:
+    """See `Rows.halvings`."""
+    return (kind >> np.uint8(SCALE_SHIFT)) + (kind & np.uint8(1))
+
+
 class Rows(NamedTuple):
     """R pseudo-data in one frame."""
 
     voxel: Int32  # (R, 3) voxel numbers from the frame's origin, in voxels of the row's kind
-    kind: UInt8  # (R,) FREE, HIT, SHADOW, NEAR, PASSED or MISSED
+    kind: UInt8  # (R,) one of `KINDS` + (scale << SCALE_SHIFT)
     sums: Float32  # (R, 4) sum of w (x - centre) for each axis, m; sum of w
     source: Int16  # (R,) number of the robot that saw it
 
@@ -69,12 +83,31 @@ class Rows(NamedTuple):
     @property
     def occupied(self) -> Bool:
         """(R,) which rows are hits."""
-        return self.kind == HIT
+        return self.sort == HIT
 
     @property
-    def is_half(self) -> Bool:
-        """(R,) which rows have voxels of half the resolution."""
-        return (self.kind & 1).astype(np.bool_)
+    def sort(self) -> UInt8:
+        """(R,) the kind without the scale."""
+        return self.kind & np.uint8(KIND_MASK)
+
+    @property
+    def scale(self) -> UInt8:
+        """(R,) how often the resolution was halved for it."""
+        return self.kind >> np.uint8(SCALE_SHIFT)
+
+    @property
+    def halvings(self) -> UInt8:
+        """(R,) how often the resolution was halved for the edge of its voxel."""
+        return halvings_of(self.kind)
+
+    def rescaled(self, ratio: float) -> Rows:
+        """The same rows for a map whose resolution is `ratio` times finer, but for their voxels: those are of the new kinds.
+
+        Hits, and what is told next to them, keep voxels of about their size; free space takes the map's.
+        """
+        scale = np.clip(self.scale.astype(np.int64) - round(math.log2(ratio)), 0, SCALES - 1).astype(np.uint8)
+        is_of_hit = np.isin(self.sort, (HIT, SHADOW, NEAR))
+        return self._replace(kind=np.where(is_of_hit, kind_of(0, scale) + self.sort, self.sort))
 
 
 class Added(NamedTuple):
@@ -181,10 +214,16 @@ def positions(rows: Rows, fine_m: float) -> Float64:
 
 
 @nb.njit(nogil=True, error_model="numpy", cache=True)
+def halvings(kind):
+    """As `halvings_of`, of one kind in compiled code."""
+    return np.int64(kind >> SCALE_SHIFT) + np.int64(kind & 1)
+
+
+@nb.njit(nogil=True, error_model="numpy", cache=True)
 def _positions(voxel, kind, sums, fine_m):
     out = np.empty((len(kind), 3))
     for r in range(len(kind)):
-        edge = 0.5 * fine_m if kind[r] & 1 else fine_m
+        edge = fine_m / (1 << halvings(kind[r]))
         weight = max(sums[r, 3], np.float32(1e-9))
         for c in range(3):
             offset = min(max(np.float64(sums[r, c] / weight), -_INSIDE * edge), _INSIDE * edge)
@@ -194,7 +233,7 @@ def _positions(voxel, kind, sums, fine_m):
 
 def is_label(rows: Rows) -> Bool:
     """(R,) which rows say whether their place is occupied; the others are tallies."""
-    return rows.kind < PASSED
+    return rows.sort < PASSED
 
 
 def is_alive(rows: Rows) -> Bool:
@@ -220,7 +259,7 @@ def _tile_of(voxel, kind, voxels, size):
     number = np.zeros(len(kind), np.int64)
     local = np.empty((len(kind), 3), np.int32)
     for r in range(len(kind)):
-        edge = 2 * voxels if kind[r] & 1 else voxels
+        edge = voxels << halvings(kind[r])
         for c in range(3):
             tile = voxel[r, c] // edge
             number[r] = number[r] * size[c] + tile
@@ -232,13 +271,20 @@ class Cells(NamedTuple):
     """The cell of each row: a voxel of free space and the voxels of hits in it. Evidence saturates and is forgotten by cell."""
 
     number: Int32  # (R,) from 0
+    around: (
+        Int32  # (C, SCALES - 1) the cell of each coarser scale that one lies in; -1 where that has no rows
+    )
     n: int
+
+    @staticmethod
+    def of(index: CellIndex, n: int) -> Cells:
+        """Those of an index of n cells."""
+        return Cells(index.number, _cells_around(index.keys[:n], index.table, n), n)
 
 
 def cells(rows: Rows) -> Cells:
     """Number the cells that have rows."""
-    index, n = _index_of(rows)
-    return Cells(index.number, n)
+    return Cells.of(*_index_of(rows))
 
 
 def forget(rows: Rows, gained: Float32, cells: Cells, limit: float) -> None:
@@ -259,7 +305,9 @@ def counts(rows: Rows, cells: Cells, saturation: float) -> Float32:
     Looks at one place repeat each other. So a cell counts for less than `saturation` looks, shared among its rows by weight.
     Shadows count a part of a look where nothing in their cell was seen to be free, and nothing elsewhere; tallies never count.
     """
-    return np.asarray(_counts(rows.kind, rows.sums, cells.number, cells.n, saturation), np.float32)
+    return np.asarray(
+        _counts(rows.kind, rows.sums, cells.number, cells.around, cells.n, saturation), np.float32
+    )
 
 
 def clip(rows: Rows, memory: float) -> None:
@@ -269,8 +317,9 @@ def clip(rows: Rows, memory: float) -> None:
     """
     most = np.full(len(LABELS), np.inf, np.float32)
     most[SHADOW], most[[PASSED, MISSED]] = 1.0, memory
-    heavy = np.flatnonzero(rows.sums[:, 3] > most[rows.kind])
-    rows.sums[heavy] *= (most[rows.kind[heavy]] / rows.sums[heavy, 3])[:, None]
+    at_most = most[rows.sort]
+    heavy = np.flatnonzero(rows.sums[:, 3] > at_most)
+    rows.sums[heavy] *= (at_most[heavy] / rows.sums[heavy, 3])[:, None]
 
 
 def decay(rows: Rows, factor: float) -> Rows:
@@ -301,10 +350,22 @@ def _n_runs(voxel, kind):
     n, last = 0, np.int64(-1)
     for r in range(len(kind)):
         shift = kind[r] & 1
-        key = pack(0, voxel[r, 0] >> shift, voxel[r, 1] >> shift, voxel[r, 2] >> shift)
+        key = pack(kind[r] >> SCALE_SHIFT, voxel[r, 0] >> shift, voxel[r, 1] >> shift, voxel[r, 2] >> shift)
         n += key != last
         last = key
     return n
+
+
+@nb.njit(nogil=True, error_model="numpy", cache=True)
+def _cells_around(keys, table, n):
+    """See `Cells.around`."""
+    out = np.full((n, SCALES - 1), -1, np.int32)
+    for cell in range(n):
+        scale, x, y, z = unpack(keys[cell])
+        for coarser in range(scale):
+            shift = scale - coarser
+            out[cell, coarser] = table[find(table, keys, pack(coarser, x >> shift, y >> shift, z >> shift))]
+    return out
 
 
 @nb.njit(nogil=True, error_model="numpy", cache=True)
@@ -317,7 +378,7 @@ def _enter_cells(voxel, kind, index):
     n, cell, last = 0, np.int64(-1), np.int64(-1)
     for r in range(len(kind)):
         shift = kind[r] & 1
-        key = pack(0, voxel[r, 0] >> shift, voxel[r, 1] >> shift, voxel[r, 2] >> shift)
+        key = pack(kind[r] >> SCALE_SHIFT, voxel[r, 0] >> shift, voxel[r, 1] >> shift, voxel[r, 2] >> shift)
         if key != last:
             cell = enter(table, keys, n, key)
             if cell == n:
@@ -338,10 +399,10 @@ def _add(rows, gained, n, points, kind, weight, fine_m, source, index, n_cells):
     at = np.empty(3, np.int64)
     for i in range(len(points)):
         k = kind[i]
-        edge = 0.5 * fine_m if k & 1 else fine_m
+        edge = fine_m / (1 << halvings(k))
         for c in range(3):
             at[c] = np.int64(np.floor(points[i, c] / edge))
-        key = pack(0, at[0] >> (k & 1), at[1] >> (k & 1), at[2] >> (k & 1))
+        key = pack(k >> SCALE_SHIFT, at[0] >> (k & 1), at[1] >> (k & 1), at[2] >> (k & 1))
         place = find(table, keys, key)
         cell = table[place]
         r = np.int32(-1) if cell < 0 else head[cell]
@@ -379,20 +440,31 @@ def _add(rows, gained, n, points, kind, weight, fine_m, source, index, n_cells):
 
 
 @nb.njit(nogil=True, error_model="numpy", cache=True)
-def _counts(kind, sums, cell, n_cells, saturation):
+def _counts(kind, sums, cell, around, n_cells, saturation):
     total, free = np.zeros(n_cells), np.zeros(n_cells)
     for r in range(len(kind)):
-        if kind[r] < PASSED and kind[r] != SHADOW:
+        sort = kind[r] & KIND_MASK
+        if sort < PASSED and sort != SHADOW:
             weight = max(sums[r, 3], np.float32(0))
             total[cell[r]] += weight
-            if kind[r] != HIT:
+            if sort != HIT:
                 free[cell[r]] += weight
+    seen = free >= _SEEN
+    for c in range(n_cells):
+        for coarser in around[c]:
+            if coarser >= 0 and free[c] >= _SEEN:
+                seen[coarser] = True
+    for c in range(n_cells):
+        for coarser in around[c]:
+            if coarser >= 0 and free[coarser] >= _SEEN:
+                seen[c] = True
     out = np.zeros(len(kind), np.float32)
     for r in range(len(kind)):
-        if kind[r] == SHADOW:
-            if free[cell[r]] < _SEEN:
+        sort = kind[r] & KIND_MASK
+        if sort == SHADOW:
+            if not seen[cell[r]]:
                 out[r] = _SHADOW_COUNT
-        elif kind[r] < PASSED:
+        elif sort < PASSED:
             out[r] = max(sums[r, 3], np.float32(0)) / (1.0 + total[cell[r]] / saturation)
     return out
 

@@ -17,6 +17,7 @@ from potserver.numerics.evidence import (
     SeenThrough,
     add,
     is_alive,
+    kind_of,
     positions,
     see_through,
 )
@@ -74,6 +75,20 @@ def test_what_has_left_is_taken_out_and_free_space_stands_in_its_place() -> None
     np.testing.assert_array_equal(rows.sums[1:], before[1:])  # beside the beams, and at their ends
     np.testing.assert_allclose(seen.points[seen.kind == FREE], where[:1], atol=1e-6)
     assert seen.weight[seen.kind == FREE][0] > 1.0
+
+
+def test_finer_hits_leave_with_the_voxel_of_the_resolution_that_they_lie_in() -> None:
+    kind = kind_of(HIT, np.array([2, 2, 1, 0], np.uint8))
+    rows = rows_of(
+        [[3.0, 0.01, 0.01], [3.09, 0.01, 0.01], [3.0, 0.09, 0.09], [3.05, 0.05, 0.05]], kind, [10.0] * 4
+    )
+    beside = rows_of([[3.0, 1.5, 0.0]], kind[:1])
+    both = Rows.concatenate([rows, beside])
+    seen = _see_through(both, _fan(24), True)
+    assert (both.sums[: len(rows.kind), 3] == 0.0).all()
+    assert both.sums[-1, 3] == 1.0
+    assert (seen.kind == FREE).sum() == 1
+    assert set(seen.kind.tolist()) <= {FREE, PASSED, MISSED}
 
 
 def test_it_takes_longer_for_what_gave_few_echoes_and_for_few_beams() -> None:

@@ -10,6 +10,8 @@ from potserver.numerics.evidence import (
     HIT,
     LABELS,
     NEAR,
+    PASSED,
+    SCALES,
     SHADOW,
     add,
     cells,
@@ -18,6 +20,7 @@ from potserver.numerics.evidence import (
     decay,
     forget,
     is_alive,
+    kind_of,
     positions,
 )
 from tests.numerics.evidence.samples import FINE_M, rows_of
@@ -43,7 +46,7 @@ def test_a_cell_is_a_free_voxel_and_the_hits_in_it() -> None:
     rows = rows_of(
         [[0.1, 0.1, 0.1], [0.3, 0.3, 0.3], [0.2, 0.2, 0.1], [0.5, 0.1, 0.1]], [True, True, False, True]
     )
-    number, n = cells(rows)
+    number, _, n = cells(rows)
     assert n == 2
     assert number[0] == number[1] == number[2] != number[3]
 
@@ -87,9 +90,42 @@ def test_kinds_have_rows_of_their_own_in_voxels_of_their_own() -> None:
     rows = rows_of(points, kind)
     assert sorted(rows.kind.tolist()) == [FREE, HIT, SHADOW, NEAR]
     assert rows.occupied.tolist() == [k == HIT for k in rows.kind]
-    assert rows.is_half.tolist() == [k in (HIT, NEAR) for k in rows.kind]
+    assert rows.halvings.tolist() == [k in (HIT, NEAR) for k in rows.kind]
     np.testing.assert_allclose(positions(rows, FINE_M), points, atol=1e-6)
     assert LABELS[[FREE, HIT, SHADOW, NEAR]].tolist() == [0.0, 1.0, 0.5, 0.0]
+
+
+def test_rows_of_a_scale_have_voxels_of_half_the_edge() -> None:
+    kind = kind_of(HIT, np.arange(SCALES, dtype=np.uint8))
+    for apart_m, n in ((0.24, (2, 2, 2)), (0.12, (1, 2, 2)), (0.06, (1, 1, 2))):
+        for scale in range(SCALES):
+            points = np.array([[0.01, 0.01, 0.01], [0.01 + apart_m, 0.01, 0.01]])
+            rows = rows_of(points, np.repeat(kind[scale : scale + 1], 2))
+            assert len(rows.kind) == n[scale]
+            assert rows.scale.tolist() == [scale] * n[scale]
+            assert rows.occupied.all()
+            np.testing.assert_allclose(positions(rows, FINE_M).mean(axis=0), points.mean(axis=0), atol=1e-6)
+
+
+@pytest.mark.parametrize("scale", [1, 2])
+def test_a_shadow_is_none_where_another_scale_saw_free_space(scale: int) -> None:
+    """A thin plate, seen from both sides by beams that lie closely on one of them."""
+    fine, coarse = np.array([scale, 0], np.uint8), np.array([0, scale], np.uint8)
+    for scales in (fine, coarse):
+        kind = np.array([kind_of(SHADOW, scales[:1])[0], kind_of(NEAR, scales[1:])[0]])
+        rows = rows_of(np.tile([0.1, 0.1, 0.1], (2, 1)), kind)
+        count = dict(zip(rows.sort.tolist(), counts(rows, cells(rows), 20.0).tolist(), strict=True))
+        assert count[SHADOW] == 0.0
+        assert count[NEAR] > 0.0
+
+
+def test_rows_keep_their_size_in_a_map_of_another_resolution() -> None:
+    sort = np.array([FREE, HIT, NEAR, SHADOW, PASSED], np.uint8)
+    rows = rows_of(np.arange(15.0).reshape(5, 3), sort + kind_of(0, np.array([0, 1, 1, 1, 0], np.uint8)))
+    assert rows.rescaled(1.1).kind.tolist() == rows.kind.tolist()
+    assert rows.rescaled(2.0).kind.tolist() == rows.sort.tolist()
+    assert rows.rescaled(0.5).scale.tolist() == [2 * (k in (HIT, NEAR, SHADOW)) for k in rows.sort]
+    assert rows.rescaled(2.0).sort.tolist() == rows.sort.tolist()
 
 
 def test_a_shadow_counts_only_where_nobody_looked() -> None:
