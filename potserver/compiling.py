@@ -1,37 +1,82 @@
 """The numerics compiled by two processes, where nothing has compiled them before: the first start of a server on a machine.
 
-numba compiles one function at a time in a process, which takes half a minute for all, and keeps each one in its cache. A
-second process that begins at the other end therefore saves the first one half of the work: each takes from the cache what the
-other has compiled.
+numba compiles one function at a time in a process, and keeps each one in its cache. A second process that begins elsewhere
+saves the first one half of the work: each takes from the cache what the other has compiled. No start waits for what only
+those senders need who ask for transported parameters: the second process compiles it when the server is there already.
 """
 
 from __future__ import annotations
 
-import contextlib
+import os
+import signal
 import subprocess
 import sys
-from collections.abc import Iterator
 
 import numpy as np
 
 from potserver.adapters.questions import registry
 from potserver.log import get_logger
+from potserver.mapping.fitting import fitted_map
 from potserver.mapping.service import MappingService
 from potserver.mapping.settings import MappingSettings
+from potserver.numerics import evidence
+from potserver.numerics.beams import Beams
 from potserver.numerics.geometry import bounds
+from potserver.numerics.surface import Normals
+from potserver.threads import spawn
 
 log = get_logger("potserver.server")
+
+_FINE_M = 0.4  # resolution of what is compiled with
 
 _warm: set[str] = set()  # profiles whose numerics this process has
 
 
-def warm_up(mapper: MappingService) -> None:
-    """Compile or load all that scans and questions need, with help if it must be compiled."""
+class Helper:
+    """A process that compiles beside this one; without it all takes longer and is the same."""
+
+    def __init__(self, profile: str) -> None:
+        """Start it.
+
+        Raises:
+            OSError: the system refuses.
+        """
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", __name__, profile],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            start_new_session=True,  # Ctrl-C is for the server, which ends its helper
+        )
+        self._watch = spawn("compile-help", self._wait)
+
+    def end(self) -> None:
+        """End it, if it still runs. What it was at is lost: numba puts files into its cache whole."""
+        self.process.terminate()
+        self._watch.join()
+
+    def _wait(self) -> None:
+        code = self.process.wait()
+        if code not in (0, -signal.SIGTERM):
+            log.warning("compile_helper_failed", detail=f"exit code {code}")
+
+
+def warm_up(mapper: MappingService) -> Helper | None:
+    """Compile or load all that scans and questions need, but for transported parameters.
+
+    Returns:
+        Who helped, and may go on with the rest; None where all was compiled before.
+    """
     profile = mapper.settings.profile
-    with _helped(profile) if profile not in _warm and _must_compile() else contextlib.nullcontext():
-        mapper.warm_up()
+    helper = _helper(profile) if profile not in _warm and _must_compile() else None
+    try:
+        mapper.warm_up(transported=False)
         registry.warm_up()
+    except BaseException:
+        if helper is not None:
+            helper.end()
+        raise
     _warm.add(profile)
+    return helper
 
 
 def _must_compile() -> bool:
@@ -40,34 +85,36 @@ def _must_compile() -> bool:
     return not bounds.stats.cache_hits
 
 
-@contextlib.contextmanager
-def _helped(profile: str) -> Iterator[None]:
-    """A second process compiles during the block; without it the block takes longer and does the same."""
+def _helper(profile: str) -> Helper | None:
     try:
-        helper = subprocess.Popen(
-            [sys.executable, "-m", __name__, profile],
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.DEVNULL,
-            start_new_session=True,  # Ctrl-C is for the server, which ends its helper
-        )
+        return Helper(profile)
     except OSError as error:
         log.warning("compile_helper_failed", detail=str(error))
-        yield
-        return
-    try:
-        yield
-    finally:
-        # what it is at now is compiled already; numba puts files into its cache whole
-        if helper.poll() is None:
-            helper.terminate()
-        elif helper.returncode:
-            log.warning("compile_helper_failed", detail=f"exit code {helper.returncode}")
-        helper.wait()
+        return None
 
 
 def _help(profile: str) -> None:
+    """First what the server comes to last: questions, the solve, and the evidence of the map."""
     registry.warm_up()
-    MappingService(settings=MappingSettings.of_profile(profile), threads=1).warm_up()
+    rng = np.random.default_rng(0)
+    beams = Beams(rng.normal(0.0, 5.0, (100, 3)), np.ones(100, np.bool_))
+    fitted_map(beams, np.zeros(3), None, _FINE_M, rng, planar=False, threads=1)
+    _enter(beams)
+    mapper = MappingService(settings=MappingSettings.of_profile(profile), threads=1)
+    mapper.warm_up(transported=False)
+    os.nice(10)  # the server is there, or about to be
+    mapper.warm_up()
+
+
+def _enter(beams: Beams) -> None:
+    """As `mapping.fusion` enters beams into rows, and what has left is taken out of them."""
+    points, n = beams.ends, len(beams.ends)
+    box = points.min(axis=0), points.max(axis=0)
+    hits, weights = np.full(n, evidence.HIT, np.uint8), np.ones(n)
+    joined = evidence.add_sparing(evidence.Rows.empty(), points, hits, weights, _FINE_M, within=box, turn=1)
+    evidence.forget(joined.rows, joined.weight, joined.cells, 1.0)
+    faces = Normals(points, np.ones(n), np.ones(n))
+    evidence.see_through(joined.rows, beams, faces, np.zeros(3), fine_m=_FINE_M, odds=1.0)
 
 
 if __name__ == "__main__":

@@ -32,7 +32,7 @@ from potserver.adapters.session import (
 )
 from potserver.adapters.stats import StatsPublisher, stats_now
 from potserver.atoms.store import AtomStore
-from potserver.compiling import warm_up
+from potserver.compiling import Helper, warm_up
 from potserver.config import Settings, as_tree
 from potserver.domain.dictionary import AtomDictionary
 from potserver.domain.order import Heard
@@ -85,6 +85,7 @@ class MapServer:
         self.pool: QueryPool | None = None
         self._stats: StatsPublisher | None = None
         self._sessions: SessionWatch | None = None
+        self._helper: Helper | None = None  # compiles beside us
         self._max_sessions = 0
         self._stores: dict[str, MapStore | ReadOnlyStore] = {}
         self.web: WebListener | None = None
@@ -215,7 +216,7 @@ class MapServer:
             served = [keys.MapKeys(s.root, map_id) for map_id in s.maps]
             with OtherServers(self._session, served) as others:
                 others.refuse()
-                _warm_up(mappers[0])  # all maps share the compiled numerics
+                self._helper = _warm_up(mappers[0])  # all maps share the compiled numerics
                 others.refuse()  # one that was warming up beside us
             self._serve(self._session, mappers, heard)
         except BaseException:
@@ -308,6 +309,8 @@ class MapServer:
         if session is None:
             return True
         self._stopping.set()
+        if self._helper is not None:
+            self._helper.end()
         nodes = list(self.nodes.values())
         log.info(
             "server_draining", clouds=sum(node.intake.depth for node in nodes), timeout_s=drain_timeout_s
@@ -332,10 +335,11 @@ class MapServer:
         return clean
 
 
-def _warm_up(mapper: MappingService) -> None:
+def _warm_up(mapper: MappingService) -> Helper | None:
     started_s = time.perf_counter()
-    warm_up(mapper)
+    helper = warm_up(mapper)
     log.info("server_warmed_up", elapsed_ms=round((time.perf_counter() - started_s) * 1e3, 1))
+    return helper
 
 
 def _atom_store(mappers: list[MappingService], settings: Settings) -> AtomStore:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import subprocess
 import sys
 
@@ -29,22 +30,41 @@ def test_the_helper_does_its_half() -> None:
 
 
 @pytest.mark.usefixtures("cold")
-def test_the_helper_ends_with_the_warm_up(monkeypatch: pytest.MonkeyPatch) -> None:
-    started: list[subprocess.Popen[bytes]] = []
+def test_the_helper_ends_when_it_is_told_to() -> None:
+    mapper = MappingService(settings=MappingSettings(), threads=1)
+    helper = compiling.warm_up(mapper)
+    assert helper is not None
+    helper.end()
+    assert helper.process.returncode in (0, -signal.SIGTERM)
+    assert compiling.warm_up(mapper) is None  # once in a process
+    assert mapper.n_scans == 0
 
-    class Noted(subprocess.Popen):  # type: ignore[type-arg]
-        def __init__(self, *args: object, **options: object) -> None:
-            super().__init__(*args, **options)  # type: ignore[call-overload]
+
+@pytest.mark.usefixtures("cold")
+def test_the_helper_ends_with_a_warm_up_that_fails(monkeypatch: pytest.MonkeyPatch) -> None:
+    started: list[compiling.Helper] = []
+
+    class Noted(compiling.Helper):
+        def __init__(self, profile: str) -> None:
+            super().__init__(profile)
             started.append(self)
 
-    monkeypatch.setattr(subprocess, "Popen", Noted)
-    mapper = MappingService(settings=MappingSettings(), threads=1)
-    compiling.warm_up(mapper)
+    def fail() -> None:
+        raise MemoryError
+
+    monkeypatch.setattr(compiling, "Helper", Noted)
+    monkeypatch.setattr(compiling.registry, "warm_up", fail)
+    with pytest.raises(MemoryError):
+        compiling.warm_up(MappingService(settings=MappingSettings(), threads=1))
     (helper,) = started
-    assert helper.returncode is not None
-    compiling.warm_up(mapper)
-    assert len(started) == 1  # once in a process
-    assert mapper.n_scans == 0
+    assert helper.process.returncode == -signal.SIGTERM
+
+
+def test_a_helper_that_fails_is_told_of(caplog: pytest.LogCaptureFixture) -> None:
+    helper = compiling.Helper("no such profile")
+    helper.process.wait()
+    helper.end()
+    assert caplog.text.count("compile_helper_failed") == 1
 
 
 @pytest.mark.usefixtures("cold")

@@ -220,8 +220,13 @@ class MappingService:
             snapshot = state.snapshot.with_parts(list(tiled.parts.values()))
             self.state = dataclasses.replace(state, tiled=tiled, snapshot=snapshot)
 
-    def warm_up(self) -> None:
-        """Compile or load the numerics on small synthetic scans, in a map of its own."""
+    def warm_up(self, *, transported: bool = True) -> None:
+        """Compile or load the numerics on small synthetic scans, in a map of its own.
+
+        Args:
+            transported: Also what only the senders need that ask for transported parameters.
+        """
+        kinds = ParamsKind.FITTED, ParamsKind.TRANSPORTED if transported else ParamsKind.FITTED
         rng = np.random.default_rng(0)
         for planar in (False, True):
             scratch = MappingService(
@@ -230,7 +235,7 @@ class MappingService:
             angle = rng.uniform(-np.pi, np.pi, 4000)
             height = np.zeros(4000) if planar else rng.uniform(-1.5, 3.0, 4000)
             points = np.stack([8.0 * np.cos(angle), 6.0 * np.sin(angle), height], axis=1).astype(np.float32)
-            for k, params in enumerate((ParamsKind.FITTED, ParamsKind.TRANSPORTED)):
+            for k, params in enumerate(kinds):
                 pose = yaw_pose(0.3 * k, 0.0, 0.0)
                 scratch.integrate(Scan(points=points, T_map_sensor=pose, is_planar=planar), params=params)
             scratch.snapshot.occupancy(points)

@@ -346,7 +346,7 @@ class FakeMapper:
         self._become(KernelSet.empty(), 0)
         return TileChange(10.0, [(int(x), int(y), int(z)) for x, y, z in tiles])
 
-    def warm_up(self) -> None:
+    def warm_up(self, *, transported: bool = True) -> None:
         self.warming.pass_through()
 
 

@@ -264,7 +264,7 @@ def test_a_server_that_came_up_during_the_warm_up_is_seen(
 def test_a_failing_start_leaves_nothing_behind(make_rig: MakeRig) -> None:
     rig = make_rig(start=False)
 
-    def fail() -> None:
+    def fail(**_: bool) -> None:
         raise OSError("no numerics")
 
     rig.mapper.warm_up = fail
