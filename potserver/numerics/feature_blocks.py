@@ -24,7 +24,10 @@ from potserver.numerics.threads import parallel_map, spans
 # Kernels of a cube of rounded values are filled up to a multiple of this: whole vectors are faster than what is left over.
 _LANES = 8
 _FAR = np.array([1e4, 1e4, 1e4, -1.0], np.float32)  # relative hinge, m, and -gamma of what fills up
-_SPANS = 8  # of cubes; fixed, so that sums over spans do not depend on the number of threads
+_SPANS = (
+    8  # of cubes, at most; the number of threads plays no part in how they are cut, and so none in the sums
+)
+_ROWS_OF_SPAN = 4096  # at least: fewer take no longer than it does to hand them to a thread
 
 
 class Block(NamedTuple):
@@ -95,7 +98,8 @@ def feature_blocks(
             ),
         )  # fmt: skip
 
-    return Blocks(order, parallel_map(run, spans(len(groups) - 1, _SPANS), threads), len(hinge), unit)
+    cut_up = spans(len(groups) - 1, min(_SPANS, 1 + len(points) // _ROWS_OF_SPAN))
+    return Blocks(order, parallel_map(run, cut_up, threads), len(hinge), unit)
 
 
 def product(blocks: Blocks, weights: Float32, *, threads: int = 1) -> Float32:
@@ -144,6 +148,8 @@ def normal_product(blocks: Blocks, curvature: Float32, direction: Float32, *, th
         blocks.parts,
         threads,
     )
+    if len(parts) == 1:
+        return parts[0]
     return np.sum(parts, axis=0, dtype=np.float32) if parts else np.zeros(blocks.n_kernels, np.float32)
 
 
