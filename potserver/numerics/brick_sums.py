@@ -187,7 +187,7 @@ def windows_of(t, number, x, y, z, room):
 @_jit
 def sums_at(t, x, y, z, room):
     """At one point: the three sums, and the kernels' widths, m, summed by what each adds to the activation."""
-    mean, var, activation, widths = np.float32(0), np.float32(0), np.float32(0), np.float32(0)
+    mean = var = activation = widths = splat8(np.float32(0))
     factors = room + FACTORS
     for number in range(t.n_lattices):
         lattice = t.lattices + LATTICE_BYTES * number
@@ -204,21 +204,21 @@ def sums_at(t, x, y, z, room):
             for k in range(load_i64(window + FROM_Z), load_i64(window + TO_Z)):
                 if not (layers >> k) & 1:
                     continue
-                fz = load_f32(factors + 2 * BYTES_OF_AXIS + 4 * k)
+                # sums of its own for a layer: additions to one sum would wait for each other
+                m_layer = v_layer = a_layer = splat8(np.float32(0))
                 for j in range(y0, y1):
                     row = start + BYTES_OF_ROW * load_i16(first + 2 * (k * ROWS + j))
-                    c = fz * load_f32(factors + BYTES_OF_AXIS + 4 * j)
-                    once, twice = splat8(c), splat8(c * c)
-                    m = fma8(once, load8(row), m)
-                    v = fma8(twice, load8(row + TO_VARIANCES), v)
-                    a = fma8(once, load8(row + TO_KNOWN), a)
-            f = load8(factors)
-            mean += sum8(times8(f, m))
-            var += sum8(times8(times8(f, f), v))
-            here = sum8(times8(f, a))
-            activation += here
-            widths += np.float32(load_f64(lattice + WIDTH)) * here
-    return mean, var, activation, widths
+                    fy = splat8(load_f32(factors + BYTES_OF_AXIS + 4 * j))
+                    m_layer = fma8(fy, load8(row), m_layer)
+                    v_layer = fma8(times8(fy, fy), load8(row + TO_VARIANCES), v_layer)
+                    a_layer = fma8(fy, load8(row + TO_KNOWN), a_layer)
+                fz = splat8(load_f32(factors + 2 * BYTES_OF_AXIS + 4 * k))
+                m, v, a = fma8(fz, m_layer, m), fma8(times8(fz, fz), v_layer, v), fma8(fz, a_layer, a)
+            fx = load8(factors)
+            mean, var = fma8(fx, m, mean), fma8(times8(fx, fx), v, var)
+            activation = fma8(fx, a, activation)
+            widths = fma8(times8(splat8(np.float32(load_f64(lattice + WIDTH))), fx), a, widths)
+    return sum8(mean), sum8(var), sum8(activation), sum8(widths)
 
 
 @_jit
