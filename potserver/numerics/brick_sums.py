@@ -11,7 +11,7 @@ import numba as nb
 import numpy as np
 
 from potschemas.answers import LatentGradients, LatentSums
-from potserver.numerics.arrays import Float32, Float64, Int64
+from potserver.numerics.arrays import Float32, Float64
 from potserver.numerics.brick_map import (
     AT_BRICK,
     AT_LANE,
@@ -58,7 +58,7 @@ from potserver.numerics.threads import parallel_map, spans
 
 _WORTH_THREADS = 2048  # points; with fewer one thread is as fast as several
 # So many points, in a map of more bytes than a processor's own cache has, are asked cube by cube.
-_WORTH_SORTING, _CACHE_BYTES, _CUBE_M = 4096, 4 * 2**20, 4.0
+_WORTH_SORTING, _CACHE_BYTES, _CUBE_M = 4096, 2**20, 4.0
 TO_VARIANCES, TO_KNOWN = (
     4 * ROW,
     8 * ROW,
@@ -85,17 +85,14 @@ def brick_sums(bricks: BrickMap, points: Float64, *, threads: int = 1, lane: str
     Returns:
         float32.
     """
-    out = np.zeros((4, len(points)), np.float32)
-    _by_spans(_sum_points, bricks, points, out, threads, lane)
-    return LatentSums(*out[:3])
+    return LatentSums(*_by_spans(_sum_points, bricks, points, 4, threads, lane)[:3])
 
 
 def brick_widths(
     bricks: BrickMap, points: Float64, *, threads: int = 1, lane: str = "map"
 ) -> tuple[Float32, Float32]:
     """(N,) activation, and the kernels' widths, m, summed by what each adds to it; arguments as `brick_sums`."""
-    out = np.zeros((4, len(points)), np.float32)
-    _by_spans(_sum_points, bricks, points, out, threads, lane)
+    out = _by_spans(_sum_points, bricks, points, 4, threads, lane)
     return out[2], out[3]
 
 
@@ -103,29 +100,38 @@ def brick_gradients(
     bricks: BrickMap, points: Float64, *, threads: int = 1, lane: str = "map"
 ) -> LatentGradients:
     """Gradients of `brick_sums`, per metre; arguments as there."""
-    out = np.zeros((len(points), 3, 3), np.float32)
-    _by_spans(_slope_points, bricks, points, out, threads, lane)
-    return LatentGradients(out[:, 0], out[:, 1], out[:, 2])
+    out = _by_spans(_slope_points, bricks, points, 9, threads, lane)
+    return LatentGradients(out[:3].T, out[3:6].T, out[6:].T)
 
 
 def _by_spans(
-    function: Callable[[Float64, Int64, BrickTable, Float32, Float32], None],
+    function: Callable[[Float64, BrickTable, Float32, Float32], None],
     bricks: BrickMap,
     points: Float64,
-    out: Float32,
+    n_sums: int,
     threads: int,
     lane: str,
-) -> None:
+) -> Float32:
+    """(n_sums, N) what a function adds to zeros, at N points."""
     n = len(points)
+    out = np.zeros((n_sums, n), np.float32)
     if n == 0 or len(bricks) == 0:
-        return
+        return out
     is_far_apart = n >= _WORTH_SORTING and bricks.n_bytes >= _CACHE_BYTES
-    order = sort_into_cubes(points, _CUBE_M)[0] if is_far_apart else np.arange(n)
+    order = sort_into_cubes(points, _CUBE_M)[0] if is_far_apart else None
+
+    def run(span: tuple[int, int]) -> None:
+        # points and sums lie in the order in which they are asked: jumps among them take as long as the sums
+        which = slice(*span) if order is None else order[slice(*span)]
+        asked = points[which] if isinstance(which, slice) else points.take(which, axis=0)
+        found = np.zeros((n_sums, len(asked)), np.float32)
+        function(asked, bricks.table, room_for_a_thread(), found)
+        for sums, here in zip(out, found, strict=True):
+            sums[which] = here
+
     threads = threads if n >= _WORTH_THREADS else 1
-    parallel_map(
-        lambda span: function(points, order[slice(*span)], bricks.table, room_for_a_thread(), out),
-        spans(n, 4 * threads if threads > 1 else 1), threads, lane,
-    )  # fmt: skip
+    parallel_map(run, spans(n, 4 * threads if threads > 1 else 1), threads, lane)
+    return out
 
 
 def room_for_a_thread() -> Float32:
@@ -222,15 +228,15 @@ def sums_at(t, x, y, z, room):
 
 
 @_jit
-def _sum_points(points, order, t, room, out):
+def _sum_points(points, t, room, out):
     at = room.ctypes.data
-    for q in order:
+    for q in range(len(points)):
         out[0, q], out[1, q], out[2, q], out[3, q] = sums_at(t, points[q, 0], points[q, 1], points[q, 2], at)
 
 
 @_jit
-def _slope_points(points, order, t, room, out):
-    for q in order:
+def _slope_points(points, t, room, out):
+    for q in range(len(points)):
         for number in range(t.n_lattices):
             _add_slopes(t, number, points, q, room.ctypes.data, out)
 
@@ -271,12 +277,12 @@ def _add_slopes(t, number, points, q, room, out):
                 vy, vz = fma8(splat8(c * cy), variance, vy), fma8(splat8(c * cz), variance, vz)
         f = load8(factors)
         s, ff = times8(f, load8(slopes)), times8(f, f)
-        out[q, 0, 0] += scale * sum8(times8(s, m))
-        out[q, 0, 1] += scale * sum8(times8(f, my))
-        out[q, 0, 2] += scale * sum8(times8(f, mz))
-        out[q, 1, 0] += twice * scale * sum8(times8(times8(f, s), v))
-        out[q, 1, 1] += twice * scale * sum8(times8(ff, vy))
-        out[q, 1, 2] += twice * scale * sum8(times8(ff, vz))
-        out[q, 2, 0] += scale * sum8(times8(s, a))
-        out[q, 2, 1] += scale * sum8(times8(f, ay))
-        out[q, 2, 2] += scale * sum8(times8(f, az))
+        out[0, q] += scale * sum8(times8(s, m))
+        out[1, q] += scale * sum8(times8(f, my))
+        out[2, q] += scale * sum8(times8(f, mz))
+        out[3, q] += twice * scale * sum8(times8(times8(f, s), v))
+        out[4, q] += twice * scale * sum8(times8(ff, vy))
+        out[5, q] += twice * scale * sum8(times8(ff, vz))
+        out[6, q] += scale * sum8(times8(s, a))
+        out[7, q] += scale * sum8(times8(f, ay))
+        out[8, q] += scale * sum8(times8(f, az))
