@@ -16,7 +16,6 @@ import numpy as np
 
 from potserver.adapters.questions import registry
 from potserver.log import get_logger
-from potserver.mapping.fitting import fitted_map
 from potserver.mapping.service import MappingService
 from potserver.mapping.settings import MappingSettings
 from potserver.numerics import evidence
@@ -26,8 +25,6 @@ from potserver.numerics.surface import Normals
 from potserver.threads import spawn
 
 log = get_logger("potserver.server")
-
-_FINE_M = 0.4  # resolution of what is compiled with
 
 _warm: set[str] = set()  # profiles whose numerics this process has
 
@@ -94,27 +91,26 @@ def _helper(profile: str) -> Helper | None:
 
 
 def _help(profile: str) -> None:
-    """First what the server comes to last: questions, the solve, and the evidence of the map."""
+    """First what the server comes to last: questions, and the evidence of the map."""
     registry.warm_up()
-    rng = np.random.default_rng(0)
-    beams = Beams(rng.normal(0.0, 5.0, (100, 3)), np.ones(100, np.bool_))
-    fitted_map(beams, np.zeros(3), None, _FINE_M, rng, planar=False, threads=1)
-    _enter(beams)
+    _enter_evidence()
     mapper = MappingService(settings=MappingSettings.of_profile(profile), threads=1)
     mapper.warm_up(transported=False)
     os.nice(10)  # the server is there, or about to be
     mapper.warm_up()
 
 
-def _enter(beams: Beams) -> None:
-    """As `mapping.fusion` enters beams into rows, and what has left is taken out of them."""
-    points, n = beams.ends, len(beams.ends)
+def _enter_evidence() -> None:
+    """As `mapping.fusion` enters a scan: what its beams see through is taken out, and then rows join."""
+    n, fine_m = 100, 0.4
+    points = np.random.default_rng(0).normal(0.0, 5.0, (n, 3))
+    kind, weight = np.full(n, evidence.HIT, np.uint8), np.ones(n)
+    rows = evidence.add(evidence.Rows.empty(), points, kind, weight, fine_m).rows
+    beams, faces = Beams(points, np.ones(n, np.bool_)), Normals(points, np.ones(n), np.ones(n))
+    evidence.see_through(rows, beams, faces, np.zeros(3), fine_m=fine_m, odds=1.0)
     box = points.min(axis=0), points.max(axis=0)
-    hits, weights = np.full(n, evidence.HIT, np.uint8), np.ones(n)
-    joined = evidence.add_sparing(evidence.Rows.empty(), points, hits, weights, _FINE_M, within=box, turn=1)
+    joined = evidence.add_sparing(rows, points, kind, weight, fine_m, within=box, turn=1)
     evidence.forget(joined.rows, joined.weight, joined.cells, 1.0)
-    faces = Normals(points, np.ones(n), np.ones(n))
-    evidence.see_through(joined.rows, beams, faces, np.zeros(3), fine_m=_FINE_M, odds=1.0)
 
 
 if __name__ == "__main__":
