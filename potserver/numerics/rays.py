@@ -103,8 +103,11 @@ def typical_width(widths: Widths) -> float:
 
 
 def fine_step(widths: Widths) -> float:
-    """A step, m, that resolves nearly all kernels: a third of the width that one kernel in twenty falls below."""
-    return (1.0 / 3.0) * widths.quantile(0.05) if len(widths.n_kernels) else 1.0
+    """A step, m, that resolves nearly all kernels: a third of the width that one kernel in ten falls below.
+
+    Few kernels of half that width, about hits of much detail, still get a step or two each.
+    """
+    return (1.0 / 3.0) * widths.quantile(0.1) if len(widths.n_kernels) else 1.0
 
 
 def count_steps(max_range_m: Float64, step_m: float) -> Int64:

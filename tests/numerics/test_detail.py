@@ -14,7 +14,7 @@ def _rays(azimuth: Float64, elevation: Float64) -> Float64:
     return np.stack([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)], axis=1)
 
 
-@pytest.mark.parametrize("apart_deg", [0.3, 1.0, 3.0])
+@pytest.mark.parametrize("apart_deg", [0.3, 1.0, 2.0])
 def test_of_beams_that_fill_a_field_of_view_the_angle_is_about_theirs(apart_deg: float) -> None:
     apart = np.radians(apart_deg)
     rays = _rays(np.arange(-0.6, 0.6, apart), np.arange(-0.3, 0.3, apart))
