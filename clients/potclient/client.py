@@ -9,6 +9,7 @@ import threading
 import weakref
 from collections.abc import Callable, Iterator, Sequence
 from types import TracebackType
+from typing import TYPE_CHECKING
 
 import numpy as np
 import zenoh
@@ -34,6 +35,9 @@ from potclient.session import SessionOptions
 from potclient.watched import WatchedCloud, watch_clouds
 from potschemas import messages
 from potschemas.keys import DEFAULT_ROOT, stats_key
+
+if TYPE_CHECKING:
+    from typing_extensions import Unpack  # of Python 3.11
 
 log = logging.getLogger("potclient")
 
@@ -324,9 +328,9 @@ class MapClient:
         *,
         quantiles: Sequence[float] = (0.05, 0.5, 0.95),
         unknown: messages.Unknown | str = messages.Unknown.PRIOR,
-        width_m: float | None = None,
-        step_m: float | None = None,
+        evidence_only: bool = False,
         timeout_s: float | None = None,
+        **summation: Unpack[rays.Summation],
     ) -> Rays:
         """Where rays first return: expected range, its standard deviation, quantiles, and where the map does not know.
 
@@ -339,15 +343,21 @@ class MapClient:
             directions: (N, 3) or (N, 2), of any length but 0.
             max_range_m: Rays end here.
             quantiles: Ascending, of the range to answer.
-            unknown: What rays take unobserved space for: occupied (it stops them), free, or prior (p = 0.5).
-            width_m: The length over which p counts as one trial; None = the kernels' own there.
-            step_m: Longest step of the summation; None = fine enough for the map's kernels.
+            unknown: What rays take unobserved space for: occupied (it stops them), free, or prior (what the map expects there,
+                or p = 0.5).
+            evidence_only: As for `occupancy`.
             timeout_s: Of one query; None takes the client's.
+            summation: `width_m`, the length over which p counts as one trial (None = the kernels' own there), and `step_m`, the
+                longest step of the sum (None = fine enough for the map's kernels).
         Raises:
             MapServerError, NoServerError, QueryTimeoutError, LostReplyError, UsageError: see there.
         """
         options = rays.RayOptions(
-            max_range_m=max_range_m, quantiles=quantiles, unknown=unknown, width_m=width_m, step_m=step_m
+            max_range_m=max_range_m,
+            quantiles=quantiles,
+            unknown=unknown,
+            evidence_only=evidence_only,
+            **summation,
         )
         return rays.rays(self._link, origins, directions, options, timeout_s)
 
@@ -360,6 +370,7 @@ class MapClient:
         resolution_m: float | None = None,
         correlation_m: float | None = None,
         dims: int = 3,
+        evidence_only: bool = False,
         timeout_s: float | None = None,
     ) -> Risk:
         """How likely a robot on a path touches something; all from one revision of the map.
@@ -370,24 +381,23 @@ class MapClient:
         Args:
             path: (P, 4, 4) T_map_body, rigid; or one of them.
             spheres: (S, 4): centre, m, body frame, and radius, m; or one of them.
-            unknown: What unobserved cells are taken for: occupied, free, or prior (p = 0.5).
+            unknown: What unobserved cells are taken for: occupied, free, or prior (what the map expects there, or p = 0.5).
             resolution_m: Edge of a cell; None = half the smallest radius.
             correlation_m: Edge of a cube that counts as one trial in the union; None = the kernels' own width there.
             dims: 2 takes the spheres for discs in the plane z = 0, for planar maps.
+            evidence_only: As for `occupancy`.
             timeout_s: Of the query; None takes the client's.
         Raises:
             MapServerError, NoServerError, QueryTimeoutError, LostReplyError, UsageError: see there.
         """
-        return risk.risk(
-            self._link,
-            path,
-            spheres,
+        options = risk.RiskOptions(
             unknown=unknown,
             resolution_m=resolution_m,
             correlation_m=correlation_m,
             dims=dims,
-            timeout_s=timeout_s,
+            evidence_only=evidence_only,
         )
+        return risk.risk(self._link, path, spheres, options, timeout_s)
 
     def params(
         self,
