@@ -16,15 +16,15 @@ import zenoh
 from numpy.typing import ArrayLike, NDArray
 
 from potclient.arguments import legal_id, map_keys
-from potclient.atoms import Atom
 from potclient.clouds import Clouds, cloud_message
+from potclient.dictionary import DictionaryMethods
 from potclient.errors import UsageError
 from potclient.feed import FeedOptions
 from potclient.kernels import KernelSet
 from potclient.link import Link, MessageT, Subscription
 from potclient.mirror import MapMirror
 from potclient.occupancy import Grid, Occupancy
-from potclient.questions import atoms, control, grid, info, params, rays, risk, tiles
+from potclient.questions import control, grid, info, params, rays, risk, tiles
 from potclient.questions.grid import ProgressCallback
 from potclient.questions.points import PointsQuestion
 from potclient.questions.rays import Rays
@@ -52,7 +52,7 @@ def _close_all() -> None:
         client.close()
 
 
-class MapClient:
+class MapClient(DictionaryMethods):
     """A connection to one map. Any thread may call any method.
 
     Args:
@@ -464,38 +464,6 @@ class MapClient:
             step=step,
             timeout_s=timeout_s,
         )
-
-    def atoms(self, *, timeout_s: float | None = None) -> list[messages.AtomInfo]:
-        """The server's dictionary, one line an atom."""
-        return atoms.atoms(self._link, timeout_s)
-
-    def atom(self, atom_id: str, *, timeout_s: float | None = None) -> Atom:
-        """One atom whole.
-
-        Raises:
-            UnknownAtomError: there is none of this id.
-        """
-        return atoms.atom(self._link, atom_id, timeout_s)
-
-    def add_atom(self, atom: Atom, *, timeout_s: float | None = None) -> messages.AtomsChanged:
-        """Put an atom into the server's dictionary, for all its maps: scans that are integrated from now on may use it.
-
-        Returns:
-            How many atoms there are now, and whether the change outlives the server (`persisted`).
-        Raises:
-            AtomRefusedError: it may not join; `reason` says which rule it breaks.
-            ReadOnlyError: the server takes no changes.
-            ShapeError, BadPointsError, EmptyError, TooLargeError: its arrays are unsound.
-            QueryTimeoutError, LostReplyError: see there; the atom may or may not have joined, `atoms` tells.
-        """
-        return atoms.add_atom(self._link, atom, timeout_s)
-
-    def remove_atom(self, atom_id: str, *, timeout_s: float | None = None) -> messages.AtomsChanged:
-        """Take an atom out of the server's dictionary; maps keep the kernels that were carried from it.
-
-        Returns, and raises beside UnknownAtomError: as `add_atom`.
-        """
-        return atoms.remove_atom(self._link, atom_id, timeout_s)
 
     def info(self, *, timeout_s: float | None = None) -> messages.Info:
         """What the server is, what it holds, and what it accepts."""

@@ -414,6 +414,8 @@ def examples() -> dict[str, m.Message]:
     add(m.AtomsQuery(action=m.AtomsAction.REMOVE, atom_id="street-corner-03"), "remove")
     add(m.AtomList(atoms=[info]))
     add(m.AtomList(atoms=[]), "empty")
+    yard = m.PlaceInfo(name="yard", times_used=12, provenance={"scans": "40", "held_out_nll": "0.1875"})
+    add(m.AtomList(atoms=[], places=[yard]), "places")
     add(atom)
     add(m.AtomsChanged(atom_id="street-corner-03", n_atoms=33, persisted=True))
     add(m.AtomsChanged(atom_id="street-corner-03", n_atoms=32, persisted=False), "in_memory")

@@ -9,7 +9,8 @@ from potclient.metrics import score
 from potclient.towns import TownRecording
 from potserver.asking.rays import Rays
 from potserver.asking.risk import Risk
-from potserver.domain.dictionary import AtomDictionary
+from potserver.domain.atom_file import Learned
+from potserver.domain.dictionary import EXPECTATION, AtomDictionary
 from potserver.domain.types import Scan, Unknown, yaw_pose
 from potserver.limits import Limits
 from potserver.mapping import leaning
@@ -110,6 +111,19 @@ def test_rays_and_risk_borrow_what_points_borrow(street: TownRecording, evidence
         assert (risk.path_borrowed_share > 0.0) == (not evidence_only)
     assert rays.borrowed_share.max() > 0.05 or evidence_only
     assert not (evidence_only and rays.borrowed_share.any())
+
+
+def test_what_foretells_a_scan_best_speaks(street: TownRecording) -> None:
+    net = AtomDictionary.builtin().expectation
+    assert net is not None
+    wrong = net._replace(last=-net.last, last_bias=-net.last_bias)
+    scan = to_scan(street[5], 5)
+    for base, other, name in ((wrong, net, "other"), (net, wrong, EXPECTATION)):
+        both = AtomDictionary(expectation=base, grown=[Learned("other", other, {})])
+        update = MappingService(both, threads=1).integrate(scan)
+        assert [borrowed.name for borrowed in update.own.borrowed] == [name]
+    neither = AtomDictionary(expectation=wrong, grown=[Learned("other", wrong, {})])
+    assert MappingService(neither, threads=1).integrate(scan).not_leaning == leaning.NOVEL
 
 
 def test_with_more_evidence_less_is_borrowed(street: TownRecording) -> None:
