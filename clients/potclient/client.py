@@ -9,7 +9,6 @@ import threading
 import weakref
 from collections.abc import Callable, Iterator, Sequence
 from types import TracebackType
-from typing import TYPE_CHECKING
 
 import numpy as np
 import zenoh
@@ -35,9 +34,6 @@ from potclient.session import SessionOptions
 from potclient.watched import WatchedCloud, watch_clouds
 from potschemas import messages
 from potschemas.keys import DEFAULT_ROOT, stats_key
-
-if TYPE_CHECKING:
-    from typing_extensions import Unpack  # of Python 3.11
 
 log = logging.getLogger("potclient")
 
@@ -330,7 +326,7 @@ class MapClient(DictionaryMethods):
         unknown: messages.Unknown | str = messages.Unknown.PRIOR,
         evidence_only: bool = False,
         timeout_s: float | None = None,
-        **summation: Unpack[rays.Summation],
+        **summation: float | None,
     ) -> Rays:
         """Where rays first return: expected range, its standard deviation, quantiles, and where the map does not know.
 

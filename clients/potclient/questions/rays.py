@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 from collections.abc import Sequence
-from typing import Any, TypedDict
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -75,13 +75,6 @@ class Rays:
             step_m=max(p.step_m for p in parts),
             revisions=tuple(sorted({r for p in parts for r in p.revisions})),
         )
-
-
-class Summation(TypedDict, total=False):
-    """How the hazard along rays is summed, see `MapClient.rays`."""
-
-    width_m: float | None
-    step_m: float | None
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
