@@ -69,7 +69,7 @@ class PoseSettings:
 class AtomSettings:
     """Changes of the atom dictionary over `ctl/atoms`."""
 
-    writable: Annotated[bool, "whoever may ask `ctl/atoms` may add and remove atoms"] = False
+    writable: Annotated[bool, "whoever may ask `ctl/atoms` or `ctl/learn` may change the dictionary"] = False
     save: Annotated[bool, "write each change to the file `dictionary`; else a restart forgets it"] = False
 
 

@@ -203,6 +203,9 @@ class MapServer:
 
     def _start(self, s: Settings) -> None:
         mappers = [self._make_map(map_id) for map_id in s.maps]
+        if s.atoms.writable and not s.store.read_only:
+            for mapper in mappers:
+                mapper.keep_looks()
         config = build_config(s.zenoh, root=s.root, wire_guard_bytes=s.limits.wire_guard_bytes)
         self._max_sessions = raise_file_limit(max_sessions_of(config))
         try:

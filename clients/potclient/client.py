@@ -15,15 +15,15 @@ import zenoh
 from numpy.typing import ArrayLike, NDArray
 
 from potclient.arguments import legal_id, map_keys
-from potclient.atoms import Atom
 from potclient.clouds import Clouds, cloud_message
+from potclient.dictionary import DictionaryMethods
 from potclient.errors import UsageError
 from potclient.feed import FeedOptions
 from potclient.kernels import KernelSet
 from potclient.link import Link, MessageT, Subscription
 from potclient.mirror import MapMirror
 from potclient.occupancy import Grid, Occupancy
-from potclient.questions import atoms, control, grid, info, params, rays, risk, tiles
+from potclient.questions import control, grid, info, params, rays, risk, tiles
 from potclient.questions.grid import ProgressCallback
 from potclient.questions.points import PointsQuestion
 from potclient.questions.rays import Rays
@@ -48,7 +48,7 @@ def _close_all() -> None:
         client.close()
 
 
-class MapClient:
+class MapClient(DictionaryMethods):
     """A connection to one map. Any thread may call any method.
 
     Args:
@@ -324,9 +324,9 @@ class MapClient:
         *,
         quantiles: Sequence[float] = (0.05, 0.5, 0.95),
         unknown: messages.Unknown | str = messages.Unknown.PRIOR,
-        width_m: float | None = None,
-        step_m: float | None = None,
+        evidence_only: bool = False,
         timeout_s: float | None = None,
+        **summation: float | None,
     ) -> Rays:
         """Where rays first return: expected range, its standard deviation, quantiles, and where the map does not know.
 
@@ -339,15 +339,21 @@ class MapClient:
             directions: (N, 3) or (N, 2), of any length but 0.
             max_range_m: Rays end here.
             quantiles: Ascending, of the range to answer.
-            unknown: What rays take unobserved space for: occupied (it stops them), free, or prior (p = 0.5).
-            width_m: The length over which p counts as one trial; None = the kernels' own there.
-            step_m: Longest step of the summation; None = fine enough for the map's kernels.
+            unknown: What rays take unobserved space for: occupied (it stops them), free, or prior (what the map expects there,
+                or p = 0.5).
+            evidence_only: As for `occupancy`.
             timeout_s: Of one query; None takes the client's.
+            summation: `width_m`, the length over which p counts as one trial (None = the kernels' own there), and `step_m`, the
+                longest step of the sum (None = fine enough for the map's kernels).
         Raises:
             MapServerError, NoServerError, QueryTimeoutError, LostReplyError, UsageError: see there.
         """
         options = rays.RayOptions(
-            max_range_m=max_range_m, quantiles=quantiles, unknown=unknown, width_m=width_m, step_m=step_m
+            max_range_m=max_range_m,
+            quantiles=quantiles,
+            unknown=unknown,
+            evidence_only=evidence_only,
+            **summation,
         )
         return rays.rays(self._link, origins, directions, options, timeout_s)
 
@@ -360,6 +366,7 @@ class MapClient:
         resolution_m: float | None = None,
         correlation_m: float | None = None,
         dims: int = 3,
+        evidence_only: bool = False,
         timeout_s: float | None = None,
     ) -> Risk:
         """How likely a robot on a path touches something; all from one revision of the map.
@@ -370,24 +377,23 @@ class MapClient:
         Args:
             path: (P, 4, 4) T_map_body, rigid; or one of them.
             spheres: (S, 4): centre, m, body frame, and radius, m; or one of them.
-            unknown: What unobserved cells are taken for: occupied, free, or prior (p = 0.5).
+            unknown: What unobserved cells are taken for: occupied, free, or prior (what the map expects there, or p = 0.5).
             resolution_m: Edge of a cell; None = half the smallest radius.
             correlation_m: Edge of a cube that counts as one trial in the union; None = the kernels' own width there.
             dims: 2 takes the spheres for discs in the plane z = 0, for planar maps.
+            evidence_only: As for `occupancy`.
             timeout_s: Of the query; None takes the client's.
         Raises:
             MapServerError, NoServerError, QueryTimeoutError, LostReplyError, UsageError: see there.
         """
-        return risk.risk(
-            self._link,
-            path,
-            spheres,
+        options = risk.RiskOptions(
             unknown=unknown,
             resolution_m=resolution_m,
             correlation_m=correlation_m,
             dims=dims,
-            timeout_s=timeout_s,
+            evidence_only=evidence_only,
         )
+        return risk.risk(self._link, path, spheres, options, timeout_s)
 
     def params(
         self,
@@ -454,38 +460,6 @@ class MapClient:
             step=step,
             timeout_s=timeout_s,
         )
-
-    def atoms(self, *, timeout_s: float | None = None) -> list[messages.AtomInfo]:
-        """The server's dictionary, one line an atom."""
-        return atoms.atoms(self._link, timeout_s)
-
-    def atom(self, atom_id: str, *, timeout_s: float | None = None) -> Atom:
-        """One atom whole.
-
-        Raises:
-            UnknownAtomError: there is none of this id.
-        """
-        return atoms.atom(self._link, atom_id, timeout_s)
-
-    def add_atom(self, atom: Atom, *, timeout_s: float | None = None) -> messages.AtomsChanged:
-        """Put an atom into the server's dictionary, for all its maps: scans that are integrated from now on may use it.
-
-        Returns:
-            How many atoms there are now, and whether the change outlives the server (`persisted`).
-        Raises:
-            AtomRefusedError: it may not join; `reason` says which rule it breaks.
-            ReadOnlyError: the server takes no changes.
-            ShapeError, BadPointsError, EmptyError, TooLargeError: its arrays are unsound.
-            QueryTimeoutError, LostReplyError: see there; the atom may or may not have joined, `atoms` tells.
-        """
-        return atoms.add_atom(self._link, atom, timeout_s)
-
-    def remove_atom(self, atom_id: str, *, timeout_s: float | None = None) -> messages.AtomsChanged:
-        """Take an atom out of the server's dictionary; maps keep the kernels that were carried from it.
-
-        Returns, and raises beside UnknownAtomError: as `add_atom`.
-        """
-        return atoms.remove_atom(self._link, atom_id, timeout_s)
 
     def info(self, *, timeout_s: float | None = None) -> messages.Info:
         """What the server is, what it holds, and what it accepts."""

@@ -32,6 +32,7 @@ class Rays:
     unknown: Unknown = Unknown.PRIOR  # what rays take unobserved space for
     width_m: float | None = None  # over which an occupancy probability is one trial; None = the kernels' own
     step_m: float | None = None  # longest step of the summation; None = `KernelMap.fine_step_m`
+    evidence_only: bool = False  # nothing is borrowed: what is not observed is unknown
 
     def plan(self, snapshot: KernelMap, limits: Limits, *, part_samples: int = PART_SAMPLES) -> RaysPlan:
         """Check the question.
@@ -71,6 +72,7 @@ class Rays:
             quantiles=quantiles,
             unknown=self.unknown,
             width_m=self.width_m,
+            evidence_only=self.evidence_only,
             part_size=max(1, part_samples // steps_a_ray),
         )
 
@@ -85,6 +87,7 @@ class RayReturns:
     quantile_m: Float64  # (N, Q); the maximum range, where a return before it is too unlikely
     unknown_range_m: Float64  # (N,) where the ray first enters unobserved space; NaN: nowhere before it ends
     unknown_share: Float64  # (N,) of the ray's expected length, in unobserved space
+    borrowed_share: Float64  # (N,) of it: the share of the answers there that is expected, and not evidence
     step_m: float  # of the summation, at most
     map_revision: int
 
@@ -101,6 +104,7 @@ class RaysPlan(Plan[FirstReturns]):
     quantiles: Float64  # (Q,) ascending
     unknown: Unknown
     width_m: float | None
+    evidence_only: bool
     part_size: int
 
     @property
@@ -120,6 +124,7 @@ class RaysPlan(Plan[FirstReturns]):
             quantiles=self.quantiles,
             unknown=self.unknown,
             width_m=self.width_m,
+            evidence_only=self.evidence_only,
         )
 
     def result(self, parts: Iterable[FirstReturns]) -> RayReturns:

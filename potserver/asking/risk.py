@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from potserver.asking.plan import Plan, check_extent, check_positive
 from potserver.domain.kernel_map import KernelMap
-from potserver.domain.types import Bool, Float64, Unknown, check_rigid
+from potserver.domain.types import Bool, Float32, Float64, Unknown, check_rigid
 from potserver.errors import BadPointsError, ShapeError, TooLargeError
 from potserver.limits import Limits
 from potserver.numerics.arrays import Int64
@@ -40,6 +40,7 @@ class Risk:
     # edge of a cube that is one trial; None = the kernels' own width there
     correlation_m: float | None = None
     dims: int = 3  # 2 takes the spheres for discs in the plane z = 0, for planar maps
+    evidence_only: bool = False  # nothing is borrowed: what is not observed is unknown
 
     def plan(self, snapshot: KernelMap, limits: Limits, *, part_cells: int = PART_CELLS) -> RiskPlan:
         """Check the question, and find the cells that the robot covers.
@@ -72,6 +73,7 @@ class Risk:
             resolution_m=float(edge),
             unknown=self.unknown,
             correlation_m=self.correlation_m,
+            evidence_only=self.evidence_only,
             part_size=part_cells,
         )
 
@@ -107,9 +109,11 @@ class PathRisk:
     max_probability: Float64  # (P,) of the likeliest cell that the robot covers
     union_probability: Float64  # (P,) that any of its cells is occupied
     unknown_share: Float64  # (P,) of its cells, unobserved
+    borrowed_share: Float64  # (P,) of what its cells are taken for: what is expected there, and not evidence
     path_max_probability: float
     path_union_probability: float  # every cell of the swept volume counted once
     path_unknown_share: float
+    path_borrowed_share: float
     n_cells: int  # of the swept volume
     resolution_m: float  # edge of a cell
     map_revision: int
@@ -129,6 +133,7 @@ class CellRisk(NamedTuple):
     probability: Float64  # (C,) of being occupied
     hazard: Float64  # (C,) what each adds to -ln P(all are free)
     unknown: Bool  # (C,)
+    borrowed: Float32  # (C,) share of the probability that is expected, and not evidence
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -142,6 +147,7 @@ class RiskPlan(Plan[CellRisk]):
     resolution_m: float
     unknown: Unknown
     correlation_m: float | None
+    evidence_only: bool
     part_size: int
 
     @property
@@ -158,7 +164,7 @@ class RiskPlan(Plan[CellRisk]):
         points = (self.swept.cells[self.items(i)].astype(np.float64) + 0.5) * self.resolution_m
         if self.dims == 2:
             points[:, 2] = 0.0
-        answer = self.snapshot.occupancy(points)
+        answer = self.snapshot.occupancy(points, evidence_only=self.evidence_only)
         is_told = answer.observed | (self.unknown is Unknown.PRIOR)
         p = np.where(is_told, answer.mean, _ASSUMED[self.unknown])
         if self.correlation_m is None:
@@ -168,27 +174,28 @@ class RiskPlan(Plan[CellRisk]):
             width = np.full(len(points), self.correlation_m)
         with np.errstate(divide="ignore"):  # a cell that is taken for occupied
             hazard = -np.log1p(-p) * (self.resolution_m / width) ** self.dims
-        return CellRisk(p, hazard, ~answer.observed)
+        return CellRisk(p, hazard, ~answer.observed, np.where(is_told, answer.borrowed, np.float32(0.0)))
 
     def result(self, parts: Iterable[CellRisk]) -> PathRisk:
         """The answer, from all parts in order."""
-        p, hazard, unknown = (np.concatenate(column) for column in zip(*parts, strict=True))
+        p, hazard, unknown, borrowed = (np.concatenate(column) for column in zip(*parts, strict=True))
         n, pose, covered = self.n_poses, self.swept.pose, self.swept.cell_of_pose
         most = np.zeros(n)
         np.maximum.at(most, pose, p[covered])
-        n_covered = np.bincount(pose, minlength=n)
+        n_covered = np.maximum(np.bincount(pose, minlength=n), 1)
         summed = np.bincount(pose, weights=hazard[covered], minlength=n)
-        n_unknown = np.bincount(pose, weights=unknown[covered], minlength=n)
         path_most = float(p.max(initial=0.0))
         # a robot smaller than the correlation length is one trial at its likeliest cell, not a part of one
         union = np.maximum(most, -np.expm1(-summed))
         return PathRisk(
             max_probability=most,
             union_probability=union,
-            unknown_share=n_unknown / np.maximum(n_covered, 1),
+            unknown_share=np.bincount(pose, unknown[covered], n) / n_covered,
+            borrowed_share=np.bincount(pose, borrowed[covered], n) / n_covered,
             path_max_probability=path_most,
             path_union_probability=max(path_most, float(union.max(initial=0.0)), -math.expm1(-hazard.sum())),
             path_unknown_share=float(unknown.mean()) if len(unknown) else 0.0,
+            path_borrowed_share=float(borrowed.mean()) if len(borrowed) else 0.0,
             n_cells=len(p),
             resolution_m=self.resolution_m,
             map_revision=self.snapshot.map_revision,

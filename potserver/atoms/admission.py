@@ -19,7 +19,7 @@ from potserver.errors import AtomRefusedError
 from potserver.numerics.scores import auc
 
 # the ids of keys and messages; an atom's id is also the name of its file
-_LEGAL_ID = re.compile(r"[a-z0-9][a-z0-9_.-]{0,62}")
+LEGAL_ID = re.compile(r"[a-z0-9][a-z0-9_.-]{0,62}")
 _COMPARED = 500  # points of each label that decide on a near duplicate; with fewer, chance decides
 
 # Bounds on an atom. The built-in ones are far inside.
@@ -60,6 +60,7 @@ class Refusal(str, Enum):
     UNEXPLAINED = "unexplained"  # the kernels do not tell the atom's own hits from its own free points
     UNCALIBRATED = "uncalibrated"  # they rank them, and say of one label that it is the other
     DUPLICATE = "duplicate"
+    TOO_FEW_SCANS = "too_few_scans"  # of those that a place is learned from
 
 
 def admit(
@@ -114,41 +115,39 @@ def _check_own_points(atom: Atom) -> None:
     """A map is only as good as what is carried into it: a ranking alone would let kernels pass that call everything free."""
     own = own_fit(atom)
     if own.auc < _MIN_AUC:
-        raise _refused(
+        raise refused(
             Refusal.UNEXPLAINED,
             f"its kernels tell its own hits from its own free points with AUC {own.auc:.3f}, need {_MIN_AUC}: learn it again",
         )
     for name, nll in (("hits", own.nll_hits), ("free points", own.nll_free)):
         if not nll <= _MAX_OWN_NLL:
-            raise _refused(
+            raise refused(
                 Refusal.UNCALIBRATED,
                 f"its kernels answer at its own {name} with NLL {nll:.2f}, need {_MAX_OWN_NLL}: learn it again",
             )
 
 
 def _check_record(atom: Atom, dictionary: AtomDictionary, max_atoms: int) -> None:
-    if not _LEGAL_ID.fullmatch(atom.atom_id):
-        raise _refused(
+    if not LEGAL_ID.fullmatch(atom.atom_id):
+        raise refused(
             Refusal.ILLEGAL_ID,
             f"the id {atom.atom_id[:80]!r} is not 1 to 63 of a-z 0-9 _ . - that start with a letter or digit",
         )
     if atom.atom_id in dictionary:
-        raise _refused(
+        raise refused(
             Refusal.TAKEN_ID,
             f"the dictionary has an atom {atom.atom_id!r}: remove it first, or take another id",
         )
     if len(dictionary) >= max_atoms:
-        raise _refused(
-            Refusal.FULL, f"the dictionary holds {len(dictionary)} atoms, the limit is {max_atoms}"
-        )
+        raise refused(Refusal.FULL, f"the dictionary holds {len(dictionary)} atoms, the limit is {max_atoms}")
     n_chars = sum(len(key) + len(value) for key, value in atom.provenance.items())
     if n_chars > _MAX_PROVENANCE_CHARS:
-        raise _refused(
+        raise refused(
             Refusal.BAD_PROVENANCE,
             f"the provenance has {n_chars} characters, the limit is {_MAX_PROVENANCE_CHARS}",
         )
     if not (0 < atom.radius_m <= _MAX_RADIUS_M and 0 < atom.azimuth_width_rad <= 2 * math.pi + 1e-6):
-        raise _refused(
+        raise refused(
             Refusal.BAD_SECTOR,
             f"the sector has a radius of {atom.radius_m:g} m and a width of {atom.azimuth_width_rad:g} rad;"
             f" need at most {_MAX_RADIUS_M:g} m and 2 pi",
@@ -158,16 +157,16 @@ def _check_record(atom: Atom, dictionary: AtomDictionary, max_atoms: int) -> Non
 def _check_counts(atom: Atom) -> None:
     for name, points in (("hits", atom.hit_points), ("free points", atom.free_points)):
         if len(points) == 0:
-            raise _refused(Refusal.NO_POINTS, f"it has no {name}: an atom needs points of both labels")
+            raise refused(Refusal.NO_POINTS, f"it has no {name}: an atom needs points of both labels")
         if len(points) > _MAX_POINTS:
-            raise _refused(
+            raise refused(
                 Refusal.TOO_MANY_POINTS,
                 f"it has {len(points)} {name}, the limit is {_MAX_POINTS}: thin them",
             )
     if len(atom.kernels) == 0:
-        raise _refused(Refusal.NO_KERNELS, "it has no kernels: nothing could be carried")
+        raise refused(Refusal.NO_KERNELS, "it has no kernels: nothing could be carried")
     if len(atom.kernels) > _MAX_KERNELS:
-        raise _refused(
+        raise refused(
             Refusal.TOO_MANY_KERNELS, f"it has {len(atom.kernels)} kernels, the limit is {_MAX_KERNELS}"
         )
 
@@ -180,7 +179,7 @@ def _check_place(atom: Atom) -> None:
     ):
         outside_m = float(_outside(atom, points).max())
         if not outside_m <= margin_m:
-            raise _refused(
+            raise refused(
                 refusal,
                 f"a {name} lies {outside_m:.2f} m outside the sector of {math.degrees(atom.azimuth_width_rad):.0f} degrees and"
                 f" {atom.radius_m:g} m, up to {margin_m:g} m are allowed: x is the sector's bisector, the sensor its apex",
@@ -212,7 +211,7 @@ def _check_kernels(atom: Atom) -> None:
     ):
         least, most = float(values.min()), float(values.max())
         if not low <= least <= most <= high:
-            raise _refused(
+            raise refused(
                 Refusal.WILD_KERNELS,
                 f"{name}: {least:.3g} to {most:.3g}, the allowed range is {low:.3g} to {high:.3g}",
             )
@@ -232,12 +231,13 @@ def _check_new(atom: Atom, dictionary: AtomDictionary, min_distance_m2: float, t
     distance = to_others[1:] - (own[0] + own[1:]) / 2.0
     nearest = int(np.argmin(distance))
     if distance[nearest] < min_distance_m2:
-        raise _refused(
+        raise refused(
             Refusal.DUPLICATE,
             f"it is a near duplicate of {others[nearest].atom_id!r}: squared distance {max(distance[nearest], 0.0):.3f} m^2,"
             f" need {min_distance_m2:g}",
         )
 
 
-def _refused(refusal: Refusal, why: str) -> AtomRefusedError:
+def refused(refusal: Refusal, why: str) -> AtomRefusedError:
+    """The error that says so."""
     return AtomRefusedError(why, reason=refusal.value)

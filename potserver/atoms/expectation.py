@@ -8,7 +8,7 @@ says at the eight nodes about a place is interpolated there as a map does it, wi
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -32,7 +32,7 @@ _GAP_M = 0.05  # before a hit, where nothing is free: the noise of a range
 _OFF_M, _OFF_SLOPE = 0.04, 0.006
 _WIDTHS = (32, 32)
 _DIGITS = 4  # kept of a weight behind the point
-_EPOCHS, _BATCH, _LEARNING_RATE = 5, 1024, 0.01
+_EPOCHS, _BATCH, _LEARNING_RATE, _RATE_OF_MORE = 5, 1024, 0.01, 0.003  # the last: of a net that goes on
 _CORNERS = np.array(list(itertools.product((0, 1), repeat=3)))
 
 
@@ -54,6 +54,49 @@ def learn_expectation(
         max_range_m: Longer beams are cut.
         seed: Of all draws.
     """
+    lesson = _lesson_of_all(recordings, max_range_m, seed)
+    if lesson is None:
+        return None
+    with one_torch_thread():
+        return _fit(lesson, seed)
+
+
+class Further(NamedTuple):
+    """A net that learned more."""
+
+    net: Perceptron
+    nll: float  # of labels that it was not told, nats
+    nll_before: float  # of the best of the nets that were known, on the same ones; ln 2 if there were none
+    n_places: int  # labels that it was told
+
+
+def learn_further(
+    known: Sequence[Perceptron],
+    scans: Sequence[Scan],
+    held_out: Sequence[Scan],
+    *,
+    max_range_m: float,
+    seed: int,
+) -> Further | None:
+    """What scans of one place add to what is known; None if they tell nothing, see `learn_expectation`.
+
+    Args:
+        known: The net that foretells the held-out scans best goes on learning.
+        scans: To learn from, in order.
+        held_out: To judge by, in order.
+        max_range_m, seed: As there.
+    """
+    told, asked = (_lesson_of_all([some], max_range_m, seed) for some in (scans, held_out))
+    if told is None or asked is None:
+        return None
+    with one_torch_thread():
+        before = [_nll(_module(net), asked) for net in known]
+        net = _fit(told, seed, known[int(np.argmin(before))] if known else None)
+        nll = _nll(_module(net), asked)
+    return Further(net, nll, min(before, default=float(np.log(2.0))), len(told.occupied))
+
+
+def _lesson_of_all(recordings: Iterable[Iterable[Scan]], max_range_m: float, seed: int) -> _Lesson | None:
     rng = np.random.default_rng(seed)
     lessons: list[_Lesson] = []
     for scans in recordings:
@@ -66,10 +109,7 @@ def learn_expectation(
                 for b, s in zip(beams[after], upright[after], strict=True)
             ]
             lessons += _lessons_of(beams[i], later, max_range_m, rng)
-    if not lessons:
-        return None
-    with one_torch_thread():
-        return _fit(_Lesson(*(np.concatenate(columns) for columns in zip(*lessons, strict=True))), seed)
+    return _Lesson(*(np.concatenate(columns) for columns in zip(*lessons, strict=True))) if lessons else None
 
 
 def _lessons_of(
@@ -149,23 +189,20 @@ def _lesson(view: Surroundings, points: Float64, occupied: Bool, rng: np.random.
     )
 
 
-def _fit(lesson: _Lesson, seed: int) -> Perceptron:
+def _fit(lesson: _Lesson, seed: int, start: Perceptron | None = None) -> Perceptron:
     torch.manual_seed(seed)
-    a, b = _WIDTHS
-    net = torch.nn.Sequential(
-        torch.nn.Linear(N_FEATURES, a), torch.nn.ReLU(), torch.nn.Linear(a, b), torch.nn.ReLU(), torch.nn.Linear(b, 1)
-    )  # fmt: skip
+    net = _module(start)
     features, shares = torch.from_numpy(lesson.features), torch.from_numpy(lesson.shares)
     occupied = torch.from_numpy(lesson.occupied.astype(np.float32))
+    rate = _LEARNING_RATE if start is None else _RATE_OF_MORE
     n_steps = _EPOCHS * -(-len(occupied) // _BATCH)
     optimizer = torch.optim.Adam(net.parameters())
-    pace = torch.optim.lr_scheduler.OneCycleLR(optimizer, _LEARNING_RATE, total_steps=n_steps)
+    pace = torch.optim.lr_scheduler.OneCycleLR(optimizer, rate, total_steps=n_steps)
     loss = torch.nn.BCEWithLogitsLoss()
     for _ in range(_EPOCHS):
         for batch in torch.randperm(len(occupied)).split(_BATCH):
             optimizer.zero_grad()
-            log_odds = (net(features[batch].float())[..., 0] * shares[batch]).sum(dim=1)
-            loss(log_odds, occupied[batch]).backward()
+            loss(_log_odds(net, features[batch], shares[batch]), occupied[batch]).backward()
             optimizer.step()
             pace.step()
     linear = [layer for layer in net if isinstance(layer, torch.nn.Linear)]
@@ -174,3 +211,36 @@ def _fit(lesson: _Lesson, seed: int) -> Perceptron:
     )
     layers = (w1, b1, w2, b2, w3[:, 0], b3)
     return Perceptron(*(np.ascontiguousarray(x.round(_DIGITS), np.float32) for x in layers))
+
+
+def _module(start: Perceptron | None) -> torch.nn.Sequential:
+    """A net of torch: with these weights, or with random ones."""
+    a, b = _WIDTHS if start is None else (len(start.first_bias), len(start.second_bias))
+    net = torch.nn.Sequential(
+        torch.nn.Linear(N_FEATURES, a), torch.nn.ReLU(), torch.nn.Linear(a, b), torch.nn.ReLU(), torch.nn.Linear(b, 1)
+    )  # fmt: skip
+    if start is not None:
+        layers = (
+            start.first.T,
+            start.first_bias,
+            start.second.T,
+            start.second_bias,
+            start.last[None],
+            start.last_bias,
+        )
+        with torch.no_grad():
+            for parameter, values in zip(net.parameters(), layers, strict=True):
+                parameter.copy_(torch.from_numpy(np.array(values)))
+    return net
+
+
+def _log_odds(net: torch.nn.Module, features: torch.Tensor, shares: torch.Tensor) -> torch.Tensor:
+    """(N,) interpolated between the nodes."""
+    return (net(features.float())[..., 0] * shares).sum(dim=1)
+
+
+def _nll(net: torch.nn.Module, lesson: _Lesson) -> float:
+    occupied = torch.from_numpy(lesson.occupied.astype(np.float32))
+    with torch.no_grad():
+        log_odds = _log_odds(net, torch.from_numpy(lesson.features), torch.from_numpy(lesson.shares))
+    return float(torch.nn.functional.binary_cross_entropy_with_logits(log_odds, occupied))

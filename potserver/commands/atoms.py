@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 
 from potclient.commands.output_files import output_file, output_folder, picture_file
-from potserver.commands import atoms_build
+from potserver.commands import atoms_build, atoms_learn
 from potserver.commands.shared import (
     EXIT_OK,
     add_group,
@@ -85,6 +85,7 @@ def add(commands: Any) -> None:
     add_settings_flags(import_)
 
     atoms_build.add(verbs)
+    atoms_learn.add(verbs)
 
 
 # --- info ---------------------------------------------------------------------------------------------------
@@ -100,6 +101,9 @@ def _info(options: argparse.Namespace) -> int:
     left = [_HEADS.index(name) for name in ("atom", *_TEXTS)]
     results_console(_LIST_COLUMNS).print(table(_HEADS, map(_cells, dictionary), left=left))
     say(f"{len(dictionary)} atoms, {sum(len(a.kernels) for a in dictionary)} kernels, {path or 'built in'}")
+    for learned in dictionary.grown:
+        noted = ", ".join(f"{key} {value}" for key, value in sorted(learned.provenance.items()))
+        say(f"grown by {learned.name}: {noted}")
     if drawn:
         say(drawn)
     return EXIT_OK

@@ -113,7 +113,7 @@ def _build(options: argparse.Namespace) -> Built:
         SettingsError: the recipe is wrong, or there is nowhere to write.
         KeyboardInterrupt: at Ctrl-C or SIGTERM; nothing is written then.
     """
-    _check_installed()
+    check_installed("torch", "open3d")
     from potserver.atoms.build.builder import build, scan_tasks
 
     recipe, folder = recipe_of(options)
@@ -159,13 +159,16 @@ def _workers(options: argparse.Namespace) -> int:
     return int(workers)
 
 
-def _check_installed() -> None:
+def check_installed(*packages: str) -> None:
     """Refuse before any work.
+
+    Args:
+        packages: That learning needs.
 
     Raises:
         DictionaryError: a package that learning needs is missing.
     """
-    missing = [name for name in ("torch", "open3d") if importlib.util.find_spec(name) is None]
+    missing = [name for name in packages if importlib.util.find_spec(name) is None]
     if missing:
         raise DictionaryError(f"learning atoms needs {' and '.join(missing)}: {how_to_install('learn')}")
 

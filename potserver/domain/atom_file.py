@@ -1,7 +1,8 @@
 """The file of an atom dictionary, `*.atoms`: a safetensors container that any reader of that format opens.
 
     header    names, dtypes, shapes and places of the arrays; one metadata entry, a canonical JSON of the version, per atom
-              id, dims, radius_m, azimuth_width_rad and provenance, and maybe what the recordings teach to expect
+              id, dims, radius_m, azimuth_width_rad and provenance, and maybe what the recordings teach to expect, and what
+              places that were mapped since have added to it
     int64     hit_offsets, free_offsets, kernel_offsets (A + 1,): atom i has the rows offsets[i] to offsets[i + 1]
     float32   hit_points (H, 3), free_points (F, 3) and the kernels' arrays, of all atoms one after the other
     uint8     sha256 (32,): of every byte of the file before it
@@ -57,6 +58,14 @@ class AtomRecord(NamedTuple):
     provenance: dict[str, str]
 
 
+class Learned(NamedTuple):
+    """What may be expected about a scan, and where it was learned."""
+
+    name: str
+    net: Perceptron
+    provenance: dict[str, str]
+
+
 class AtomFile:
     """What a file holds; lives as long as an atom of it."""
 
@@ -65,9 +74,11 @@ class AtomFile:
         path: Path,
         records: list[AtomRecord],
         expectation: Perceptron | None,
+        grown: tuple[Learned, ...],
         arrays: dict[str, NDArray[Any]],
     ) -> None:
-        self.path, self.records, self.expectation, self._arrays = path, records, expectation, arrays
+        self.path, self.records, self._arrays = path, records, arrays
+        self.expectation, self.grown = expectation, grown
 
     def atom(self, number: int) -> Atom:
         """One atom; all its arrays but the kernels' positions are read-only views of its bytes.
@@ -92,13 +103,18 @@ class AtomFile:
             raise DictionaryError(f"{self.path}: atom {record.atom_id!r}: {error}") from error
 
 
-def write_atoms(path: Path, atoms: Sequence[Atom], expectation: Perceptron | None = None) -> None:
+def write_atoms(
+    path: Path,
+    atoms: Sequence[Atom],
+    expectation: Perceptron | None = None,
+    grown: Sequence[Learned] = (),
+) -> None:
     """Write a file whole or not at all; it is on the disk when this returns, and replaces an open one without harm.
 
     Raises:
         DictionaryError: the disk refuses.
     """
-    image = _image(atoms, expectation)
+    image = _image(atoms, expectation, grown)
     partial = path.with_name(path.name + ".partial")
     try:
         with partial.open("wb") as stream:
@@ -145,11 +161,11 @@ def open_atoms(path: Path) -> AtomFile:
         raise DictionaryError(f"{path} is a safetensors file, but no atom dictionary")
     if hashlib.sha256(memoryview(content)[:-_DIGEST_BYTES]).digest() != content[-_DIGEST_BYTES:]:
         raise DictionaryError(f"{path} is damaged: its SHA-256 does not fit its content")
-    records, expectation = _parse_metadata(path, metadata[_METADATA_KEY])
-    return AtomFile(path, records, expectation, _arrays_of(path, content, described, len(records)))
+    records, expectation, grown = _parse_metadata(path, metadata[_METADATA_KEY])
+    return AtomFile(path, records, expectation, grown, _arrays_of(path, content, described, len(records)))
 
 
-def _image(atoms: Sequence[Atom], expectation: Perceptron | None) -> bytes:
+def _image(atoms: Sequence[Atom], expectation: Perceptron | None, grown: Sequence[Learned]) -> bytes:
     arrays: dict[str, NDArray[Any]] = {
         "hit_offsets": _offsets([len(atom.hit_points) for atom in atoms]),
         "free_offsets": _offsets([len(atom.free_points) for atom in atoms]),
@@ -172,10 +188,16 @@ def _image(atoms: Sequence[Atom], expectation: Perceptron | None) -> bytes:
     ]
     tree: dict[str, Any] = {"version": VERSION, "atoms": records}
     if expectation is not None:
-        tree["expectation"] = {name: values.tolist() for name, values in expectation._asdict().items()}
+        tree["expectation"] = _layers(expectation)
+    if grown:
+        tree["grown"] = [{"name": g.name, "net": _layers(g.net), "provenance": g.provenance} for g in grown]
     text = json.dumps(tree, sort_keys=True, separators=(",", ":"), allow_nan=False)
     content = to_safetensors(arrays, metadata={_METADATA_KEY: text})[:-_DIGEST_BYTES]
     return content + hashlib.sha256(content).digest()
+
+
+def _layers(net: Perceptron) -> dict[str, Any]:
+    return {name: values.tolist() for name, values in net._asdict().items()}
 
 
 def _offsets(counts: list[int]) -> NDArray[np.int64]:
@@ -214,7 +236,7 @@ def _arrays_of(
     return arrays
 
 
-def _parse_metadata(path: Path, text: str) -> tuple[list[AtomRecord], Perceptron | None]:
+def _parse_metadata(path: Path, text: str) -> tuple[list[AtomRecord], Perceptron | None, tuple[Learned, ...]]:
     try:
         tree = json.loads(text)
     except (ValueError, RecursionError) as error:
@@ -226,10 +248,23 @@ def _parse_metadata(path: Path, text: str) -> tuple[list[AtomRecord], Perceptron
             f"{path} is of version {tree.get('version')!r}, this program reads version {VERSION}"
         )
     records = [_parse_record(path, number, record) for number, record in enumerate(tree["atoms"])]
-    return records, _parse_expectation(path, tree["expectation"]) if "expectation" in tree else None
+    expectation = _parse_net(path, tree["expectation"]) if "expectation" in tree else None
+    return records, expectation, _parse_grown(path, tree.get("grown", []))
 
 
-def _parse_expectation(path: Path, told: object) -> Perceptron:
+def _parse_grown(path: Path, told: object) -> tuple[Learned, ...]:
+    if isinstance(told, list) and all(isinstance(one, dict) for one in told):
+        grown = [(one.get("name"), one.get("provenance"), one.get("net")) for one in told]
+        if all(isinstance(name, str) and _is_provenance(noted) for name, noted, _ in grown):
+            return tuple(Learned(name, _parse_net(path, net), noted) for name, noted, net in grown)
+    raise DictionaryError(f"{path}: what was learned since is incomplete, or its fields have the wrong types")
+
+
+def _is_provenance(noted: object) -> bool:
+    return isinstance(noted, dict) and all(isinstance(v, str) for v in itertools.chain(*noted.items()))
+
+
+def _parse_net(path: Path, told: object) -> Perceptron:
     try:
         layers = cast("dict[str, Any]", told).items()
         net = Perceptron(**{name: np.array(values, np.float32) for name, values in layers})
@@ -250,8 +285,7 @@ def _parse_record(path: Path, number: int, record: object) -> AtomRecord:
             and all(
                 isinstance(v, float) and 0 < v < math.inf for v in (parsed.radius_m, parsed.azimuth_width_rad)
             )
-            and isinstance(parsed.provenance, dict)
-            and all(isinstance(v, str) for v in itertools.chain(*parsed.provenance.items()))
+            and _is_provenance(parsed.provenance)
         ):
             return parsed
     raise DictionaryError(f"{path}: atom number {number} is incomplete, or its fields have the wrong types")

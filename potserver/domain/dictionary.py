@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from importlib import resources
 from pathlib import Path
 
-from potserver.domain.atom_file import AtomFile, open_atoms, write_atoms
+from potserver.domain.atom_file import AtomFile, Learned, open_atoms, write_atoms
 from potserver.domain.types import Atom
 from potserver.errors import DictionaryError, UnknownAtomError
 from potserver.numerics.surroundings import Perceptron
+
+EXPECTATION = "expectation"  # the name of what its recordings teach
 
 
 class AtomDictionary:
@@ -19,23 +21,38 @@ class AtomDictionary:
     Atoms of a file stay in it until they are asked for, so that thousands of them open at once.
     """
 
-    def __init__(self, atoms: Iterable[Atom] = (), *, expectation: Perceptron | None = None) -> None:
+    def __init__(
+        self,
+        atoms: Iterable[Atom] = (),
+        *,
+        expectation: Perceptron | None = None,
+        grown: Sequence[Learned] = (),
+    ) -> None:
         """Hold atoms.
 
         Args:
             atoms: In order.
             expectation: What the recordings that they were chosen from teach to expect about a scan; None: nothing.
+            grown: What places that were mapped since have added to it, in the order they came.
         Raises:
             DictionaryError: two atoms have one id.
         """
         self._slots = _by_id(atoms)
-        self.expectation = expectation
+        self.expectation, self.grown = expectation, tuple(grown)
 
     @classmethod
-    def _of(cls, slots: Iterable[Atom | _StoredAtom], expectation: Perceptron | None) -> AtomDictionary:
-        dictionary = cls(expectation=expectation)
+    def _of(
+        cls,
+        slots: Iterable[Atom | _StoredAtom],
+        expectation: Perceptron | None,
+        grown: Sequence[Learned],
+    ) -> AtomDictionary:
+        dictionary = cls(expectation=expectation, grown=grown)
         dictionary._slots = _by_id(slots)
         return dictionary
+
+    def _with(self, slots: Iterable[Atom | _StoredAtom]) -> AtomDictionary:
+        return AtomDictionary._of(slots, self.expectation, self.grown)
 
     def __len__(self) -> int:
         return len(self._slots)
@@ -51,6 +68,12 @@ class AtomDictionary:
         """All atoms, in order."""
         return tuple(self)
 
+    @property
+    def expectations(self) -> tuple[Learned, ...]:
+        """All that may be expected about a scan: what the recordings teach first."""
+        base = () if self.expectation is None else (Learned(EXPECTATION, self.expectation, {}),)
+        return base + self.grown
+
     def get(self, atom_id: str) -> Atom:
         """One atom.
 
@@ -61,9 +84,7 @@ class AtomDictionary:
 
     def of_dims(self, dims: int) -> AtomDictionary:
         """The atoms learned in 2 or in 3 dimensions."""
-        return AtomDictionary._of(
-            (slot for slot in self._slots.values() if slot.dims == dims), self.expectation
-        )
+        return self._with(slot for slot in self._slots.values() if slot.dims == dims)
 
     def add(self, atom: Atom) -> AtomDictionary:
         """These atoms and one more, at the end.
@@ -71,18 +92,24 @@ class AtomDictionary:
         Raises:
             DictionaryError: its id is taken.
         """
-        return AtomDictionary._of([*self._slots.values(), atom], self.expectation)
+        return self._with([*self._slots.values(), atom])
+
+    def grow(self, learned: Learned) -> AtomDictionary:
+        """These atoms, and what a place has taught: in place of what has its name, or at the end."""
+        others = [one for one in self.grown if one.name != learned.name]
+        return AtomDictionary._of(self._slots.values(), self.expectation, [*others, learned])
 
     def remove(self, atom_id: str) -> AtomDictionary:
-        """These atoms without one.
+        """These atoms without one, or without what a place of that name has taught.
 
         Raises:
             UnknownAtomError: there is none of that id.
         """
+        if atom_id not in self and any(one.name == atom_id for one in self.grown):
+            left = [one for one in self.grown if one.name != atom_id]
+            return AtomDictionary._of(self._slots.values(), self.expectation, left)
         leaving = self._slot(atom_id)
-        return AtomDictionary._of(
-            (slot for slot in self._slots.values() if slot is not leaving), self.expectation
-        )
+        return self._with(slot for slot in self._slots.values() if slot is not leaving)
 
     @staticmethod
     def builtin() -> AtomDictionary:
@@ -96,7 +123,7 @@ class AtomDictionary:
         Raises:
             DictionaryError: the disk refuses.
         """
-        write_atoms(Path(path), self.atoms, self.expectation)
+        write_atoms(Path(path), self.atoms, self.expectation, self.grown)
 
     @staticmethod
     def load(path: str | os.PathLike[str]) -> AtomDictionary:
@@ -107,7 +134,7 @@ class AtomDictionary:
         """
         file = open_atoms(Path(path))
         return AtomDictionary._of(
-            (_StoredAtom(file, number) for number in range(len(file.records))), file.expectation
+            (_StoredAtom(file, number) for number in range(len(file.records))), file.expectation, file.grown
         )
 
     def _slot(self, atom_id: str) -> Atom | _StoredAtom:

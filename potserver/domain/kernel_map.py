@@ -224,6 +224,7 @@ class KernelMap:
         quantiles: Float64,
         unknown: Unknown,
         width_m: float | None,
+        evidence_only: bool = False,
     ) -> rays.FirstReturns:
         """Where rays end, see `numerics.rays`; inputs are checked by `asking.rays`."""
         width_of_unknown = self.typical_width_m if width_m is None else width_m
@@ -232,8 +233,8 @@ class KernelMap:
             Unknown.PRIOR: math.log(2.0) / width_of_unknown,
             Unknown.OCCUPIED: math.inf,
         }
-        leans = width_of_unknown if unknown is Unknown.PRIOR else None
-        options = rays.RayOptions(step_m, quantiles, rate[unknown], leans, width_m)
+        leans = width_of_unknown if unknown is Unknown.PRIOR and not evidence_only else None
+        options = rays.RayOptions(step_m, quantiles, rate[unknown], leans, width_m, evidence_only)
         looks = rays.Rays(origins, directions, max_range_m)
         return rays.first_returns(
             self._rest, self._bricks, looks, options, self.rule, lean=self.lean, threads=self._threads

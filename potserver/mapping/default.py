@@ -54,7 +54,7 @@ class DefaultPipeline(Pipeline):
         with clock("check"):
             scores = self.check(snapshot, seen, state.scores, draws)
         after = MapState(snapshot=snapshot, tiled=tiled, stamp_ns=moment.stamp_ns, scores=scores)
-        return integrated(state, after, seen, own, fused, clock.timings_ms, expected.reason)
+        return integrated(state, after, seen, own, fused, clock.timings_ms, expected)
 
     @property
     def own_threads(self) -> int:

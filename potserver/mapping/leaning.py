@@ -7,11 +7,13 @@ says beyond the lean, so that another one would need them all solved again.
 from __future__ import annotations
 
 import itertools
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from potschemas.lean import Bytes, to_bytes
+from potserver.domain.atom_file import Learned
 from potserver.domain.tiles import TileGrid, TileIndex
 from potserver.domain.types import Bool, Borrowed, Float64
 from potserver.numerics.beams import Beams, LabelledPoints, beam_weights
@@ -19,13 +21,14 @@ from potserver.numerics.ground import LEAST_GROUND, LOWEST_EYE_M, Ground, ground
 from potserver.numerics.surroundings import Perceptron, Surroundings
 
 _JUDGED_BY, _JUDGED = 1_000, 3_000  # beams that tell of labels of the others, labelled points; at most
+_CLEARLY = 0.97  # of the first one's loss must another have
+_CHOSEN_BY = 60  # beams that tell which of what is known fits: where much was seen, all do
 _EYE_M = (LOWEST_EYE_M, 5.0)  # heights of a sensor above the ground that are expected
 _STEEPEST = 0.3  # slope of a ground
 _SURE_OF_MODEL = 5.0  # precision of the scale about 1
 _LEAST_SCALE = 0.4  # with less of it, the model does not fit here
 _REACH_M = (-1.5, 6.0)  # heights between which something is expected
 
-EXPECTATION = "expectation"  # the name of what a dictionary expects
 EVERY = 8  # steps of half a log-odd: they travel, and kernels make up for what is rounded off
 NO_MODEL, PLANAR, NO_GROUND, NOVEL = (
     "no_model",
@@ -38,7 +41,8 @@ NO_MODEL, PLANAR, NO_GROUND, NOVEL = (
 class Expected(NamedTuple):
     """What is expected around one scan."""
 
-    net: Perceptron  # of the dictionary
+    name: str  # of what in the dictionary expects it
+    net: Perceptron
     view: Surroundings  # of the scan, about `origin`
     origin: Float64  # (3,) m, map frame: the sensor
     scale: float  # of the log-odds, in (0, 1]: how well they bear out what the scan itself tells
@@ -56,7 +60,7 @@ class Expected(NamedTuple):
     def borrowed(self) -> tuple[Borrowed, ...]:
         """What of the dictionary it is made of, and where that was put."""
         below = self.origin + np.array([0.0, 0.0, self.ground.height_m])
-        return (Borrowed(EXPECTATION, 1.0, below, (self.ground.slope_x, self.ground.slope_y), self.scale),)
+        return (Borrowed(self.name, 1.0, below, (self.ground.slope_x, self.ground.slope_y), self.scale),)
 
 
 class Expectation(NamedTuple):
@@ -67,18 +71,18 @@ class Expectation(NamedTuple):
 
 
 def expect(
-    net: Perceptron | None, beams: Beams, labelled: LabelledPoints, origin: Float64, *, planar: bool
+    known: Sequence[Learned], beams: Beams, labelled: LabelledPoints, origin: Float64, *, planar: bool
 ) -> Expectation:
     """What the dictionary says about a scan's surroundings.
 
     Args:
-        net: Of the dictionary.
+        known: What may be expected; the one that foretells the scan best speaks.
         beams: Relative to the sensor, with the map's axes.
         labelled: Points on them, map frame: some tell whether what is expected from other beams is true here.
         origin: (3,) m, map frame: the sensor.
         planar: A 2D scan has no heights.
     """
-    if net is None:
+    if not known:
         return Expectation(None, NO_MODEL)
     if planar:
         return Expectation(None, PLANAR)
@@ -92,23 +96,49 @@ def expect(
         or not _EYE_M[0] <= -ground.height_m <= _EYE_M[1]
     ):
         return Expectation(None, NO_GROUND)
-    scale = _borne_out(net, ground, beams, labelled, origin)
+    best = known[0]
+    if len(known) > 1:
+        trial = _Trial.by(_CHOSEN_BY, ground, beams, labelled, origin)
+        losses = [trial.loss(learned.net) for learned in known]
+        losses[0] *= _CLEARLY
+        best = known[int(np.argmin(losses))]
+    scale = _Trial.by(_JUDGED_BY, ground, beams, labelled, origin).scale(best.net)
     if scale < _LEAST_SCALE:
         return Expectation(None, NOVEL)
-    return Expectation(Expected(net, Surroundings.of(beams, ground), origin, min(scale, 1.0)), None)
+    view = Surroundings.of(beams, ground)
+    return Expectation(Expected(best.name, best.net, view, origin, min(scale, 1.0)), None)
 
 
-def _borne_out(
-    net: Perceptron, ground: Ground, beams: Beams, labelled: LabelledPoints, origin: Float64
-) -> float:
-    """By how much a few of the beams, half of them at most, foretell the others' labels: 1 if as well as they claim."""
-    n = len(beams.ends)
-    tells = np.arange(n) % max(-(-n // _JUDGED_BY), 2) == 0
-    asked = np.flatnonzero(~tells[labelled.beam])
-    asked = asked[:: max(-(-len(asked) // _JUDGED), 1)]
-    few = Surroundings.of(beams.take(tells), ground)
-    log_odds = few.expected(labelled.points[asked] - origin, net)
-    return _scale(log_odds, labelled.occupied[asked], beam_weights(labelled)[asked])
+class _Trial(NamedTuple):
+    """Some of a scan's labels, and what a few of its other beams show."""
+
+    few: Surroundings
+    points: Float64  # (N, 3) m, about the sensor
+    occupied: Bool  # (N,)
+    weight: Float64  # (N,)
+
+    @staticmethod
+    def by(
+        most_beams: int, ground: Ground, beams: Beams, labelled: LabelledPoints, origin: Float64
+    ) -> _Trial:
+        """That of at most so many beams, and at most half of them."""
+        n = len(beams.ends)
+        tells = np.arange(n) % max(-(-n // most_beams), 2) == 0
+        asked = np.flatnonzero(~tells[labelled.beam])
+        asked = asked[:: max(-(-len(asked) // _JUDGED), 1)]
+        weight = beam_weights(labelled)[asked]
+        few = Surroundings.of(beams.take(tells), ground)
+        return _Trial(few, labelled.points[asked] - origin, labelled.occupied[asked], weight)
+
+    def scale(self, net: Perceptron) -> float:
+        """By how much what the beams foretell is borne out: 1 if as well as it claims."""
+        return _scale(self.few.expected(self.points, net), self.occupied, self.weight)
+
+    def loss(self, net: Perceptron) -> float:
+        """What the labels say against it, scaled so, nats."""
+        log_odds = self.few.expected(self.points, net)
+        log_odds *= min(_scale(log_odds, self.occupied, self.weight), 1.0)
+        return float((self.weight * np.logaddexp(0.0, np.where(self.occupied, -log_odds, log_odds))).sum())
 
 
 def _scale(log_odds: Float64, occupied: Bool, weight: Float64) -> float:

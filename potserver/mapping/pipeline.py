@@ -186,7 +186,7 @@ class Pipeline(ABC):
     def expect(self, seen: LabelledScan, carrier: Carrier) -> Expectation:
         """What the dictionary expects around a scan."""
         return expect(
-            carrier.dictionary.expectation,
+            carrier.dictionary.expectations,
             seen.beams.learned,
             seen.labelled,
             seen.scan.origin,
@@ -215,7 +215,7 @@ def integrated(
     own: OwnMap,
     fused: Fused,
     timings_ms: dict[str, float],
-    not_leaning: str | None = None,
+    expected: Expectation | None = None,
 ) -> Integrated:
     """The new state with the report for the sender.
 
@@ -226,7 +226,7 @@ def integrated(
         own: What goes back to its sender.
         fused: What changed in the overall map.
         timings_ms: By step.
-        not_leaning: Why the map does not lean about this scan; None: it does, or the pipeline never does.
+        expected: What the map leans on about this scan; None: the pipeline never leans.
     """
     assert after.tiled is not None, "a scan makes a map"
     update = MapUpdate(
@@ -240,7 +240,8 @@ def integrated(
         rule=rule_of(own, after.snapshot.rule),
         changed=TileChange(after.tiled.grid.size_m, sorted(fused.tiles)),
         timings_ms=timings_ms,
-        not_leaning=not_leaning,
+        leans_on=None if expected is None or expected.place is None else expected.place.name,
+        not_leaning=None if expected is None else expected.reason,
     )
     return Integrated(dataclasses.replace(after, epoch=before.epoch, n_scans=before.n_scans + 1), update)
 

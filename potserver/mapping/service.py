@@ -11,6 +11,7 @@ import numpy as np
 
 from potserver.domain.dictionary import AtomDictionary
 from potserver.domain.kernel_map import KernelMap
+from potserver.domain.looks import Looks
 from potserver.domain.map_state import MapState
 from potserver.domain.pages import Pages
 from potserver.domain.running_scores import RunningScores
@@ -80,6 +81,7 @@ class MappingService:
         self.map_id = map_id
         self.settings = settings or MappingSettings()
         self.atom_usage: Counter[str] = Counter()
+        self._looks: Looks | None = None
         self._threads = threads or default_threads()
         self._make_pipeline = make_pipeline
         self._pipeline = make_pipeline(self.settings, threads=self._threads, seed=seed)
@@ -134,8 +136,21 @@ class MappingService:
             commit()
         # nothing above changed the service, and nothing below can fail
         self.atom_usage.update(match.atom_id for match in update.sectors if match.atom_id is not None)
+        if update.leans_on is not None:
+            self.atom_usage[update.leans_on] += 1
+        if self._looks is not None:
+            self._looks.take(scan)
         self.state = state
         return update
+
+    def keep_looks(self) -> None:
+        """From now on keep some of the scans, up to 25 MB, for the dictionary to learn from."""
+        self._looks = Looks()
+
+    @property
+    def learned_from(self) -> tuple[Scan, ...]:
+        """The scans that were kept; none unless `keep_looks` was called."""
+        return () if self._looks is None else self._looks.scans
 
     def clear(self, *, commit: Commit | None = None) -> TileChange:
         """Forget all scans; the revision and the use of atoms go on counting, so that readers notice.
@@ -204,7 +219,10 @@ class MappingService:
         tiled, changed = edits.remove_robot(
             state.tiled, robot_id, self._pipeline.fusion, moment, threads=self._threads
         )
-        return self._edited(tiled, changed, moment, state.n_scans, commit)
+        change = self._edited(tiled, changed, moment, state.n_scans, commit)
+        if self._looks is not None:
+            self._looks.forget(robot_id)
+        return change
 
     def relieve(self, pages: Pages) -> None:
         """Keep in memory what it may hold of the map, and the rest on pages; the map is the same, to the bit.
@@ -264,6 +282,8 @@ class MappingService:
         """Put another map in the place of this one; all tiles of both have changed."""
         if commit is not None:
             commit(state)
+        if self._looks is not None:
+            self.keep_looks()
         tiles = {index for s in (self.state, state) if s.tiled is not None for index in s.tiled.tiles}
         self.state = state
         return TileChange(self.settings.tile_size_m, sorted(tiles))

@@ -1,9 +1,10 @@
-"""Carry kernels with a coupling: the three out-of-sample maps (paper, section III-B and figure "Parameter optimal transport").
+"""Carry kernels with a coupling: the out-of-sample maps (paper, section III-B and figure "Parameter optimal transport").
 
 A coupling says where the source points go: each to the barycentre of its row. Kernels lie elsewhere, so the map is extended to
 them. `nearest`: a kernel moves like the source point next to it (what the authors' code does). `linear`: one affine
 map fitted to all source points and their images (the paper's words, Perrot et al. 2016). `entropic`: the map that the dual
-potentials define everywhere (Pooladian and Niles-Weed 2021).
+potentials define everywhere (Pooladian and Niles-Weed 2021). `rigid`: the turn and shift nearest to the images, all that a
+registration could do.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ class OutOfSample(str, Enum):
     NEAREST = "nearest"
     LINEAR = "linear"
     ENTROPIC = "entropic"
+    RIGID = "rigid"
 
 
 def barycentric_images(coupling: Coupling, target: Float32) -> Float64:
@@ -63,6 +65,9 @@ def carry(
     if method is OutOfSample.LINEAR:
         linear, shift = affine_map(source.astype(np.float64), images, ridge)
         return points @ linear + shift
+    if method is OutOfSample.RIGID:
+        rotation, shift = rigid_map(source.astype(np.float64), images)
+        return points @ rotation + shift
     nearest = _nearest(np.ascontiguousarray(points, np.float64), source.astype(np.float64))
     return points + (images - source)[nearest]
 
@@ -82,6 +87,19 @@ def affine_map(source: Float64, images: Float64, ridge: float) -> tuple[Float64,
     gram = s.T @ s + weight * np.eye(3)
     linear = np.linalg.solve(gram, s.T @ (images - shift) + weight * np.eye(3))
     return linear, shift - centre @ linear
+
+
+def rigid_map(source: Float64, images: Float64) -> tuple[Float64, Float64]:
+    """The rigid map x -> x R + t nearest to sending `source` to `images`, both (n, 3) m.
+
+    Returns:
+        R (3, 3), a rotation, and t (3,), least squares.
+    Source: Kabsch 1976.
+    """
+    centre, shift = source.mean(axis=0), images.mean(axis=0)
+    u, _, v = np.linalg.svd((source - centre).T @ (images - shift))
+    rotation = (u * [1.0, 1.0, np.sign(np.linalg.det(u @ v))]) @ v
+    return rotation, shift - centre @ rotation
 
 
 @nb.njit(nogil=True, error_model="numpy", cache=True)

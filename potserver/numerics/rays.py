@@ -56,6 +56,7 @@ class RayOptions(NamedTuple):
     # m, over which what is expected of unobserved space counts as one trial, where anything is; None: it does not count
     unknown_width_m: float | None
     width_m: float | None  # what counts as one trial, m; None: the kernels' own
+    evidence_only: bool = False  # what is observed counts in full, whatever is expected there
 
 
 class FirstReturns(NamedTuple):
@@ -67,6 +68,7 @@ class FirstReturns(NamedTuple):
     quantile_m: Float64  # (N, Q)
     unknown_range_m: Float64  # (N,) where the ray first enters unobserved space; NaN: nowhere before it ends
     unknown_share: Float64  # (N,) of the ray's expected length, in unobserved space
+    borrowed_share: Float64  # (N,) of it: the share of the answers there that is expected, and not evidence
 
 
 class Widths(NamedTuple):
@@ -141,7 +143,7 @@ def first_returns(
     # copies: the march is compiled for writable arrays, and arrays that were received are read-only
     rays = Rays(*(np.array(a, np.float64, order="C") for a in rays))
     n = len(rays.origins)
-    out = np.zeros((5, n))
+    out = np.zeros((6, n))
     quantile_m = np.zeros((n, len(options.quantiles)))
     n_steps = count_steps(rays.max_range_m, options.step_m)
     widths = kernel_widths(index).astype(np.float32)
@@ -155,6 +157,7 @@ def first_returns(
         observed_activation=float(rule.observed_activation),
         residual_var=float(rule.residual_var),
         mean_moderation=float(rule.mean_moderation),
+        evidence_only=options.evidence_only,
         lean=(lean or Lean(1.0, {})).table,
     )
 
@@ -162,7 +165,7 @@ def first_returns(
         _march(*span, rays, n_steps, block, march, index, widths, room_for_a_thread(), out, quantile_m)
 
     parallel_map(run, spans(n, 8 * threads if threads > 1 else 1), threads, "query")
-    return FirstReturns(out[0], out[1], out[2], quantile_m, out[3], out[4])
+    return FirstReturns(out[0], out[1], out[2], quantile_m, *out[3:])
 
 
 class _March(NamedTuple):
@@ -176,6 +179,7 @@ class _March(NamedTuple):
     observed_activation: float
     residual_var: float  # log-odds^2
     mean_moderation: float
+    evidence_only: bool
     lean: LeanTable
 
 
@@ -236,7 +240,7 @@ def _march(first, last, rays, n_steps, block, march, index, widths, room, out, q
         survival = 1.0
         length = 0.0  # integral of the survival: the mean
         moment = 0.0  # integral of range times survival: half the second moment
-        unknown_length = 0.0
+        unknown_length, borrowed_length = 0.0, 0.0
         unknown_range = np.nan
         k = 0  # the next quantile
         step = 0
@@ -300,20 +304,24 @@ def _march(first, last, rays, n_steps, block, march, index, widths, room, out, q
                 origins[i, 1] + (r + 0.5 * h) * directions[i, 1],
                 origins[i, 2] + (r + 0.5 * h) * directions[i, 2],
             )
+            borrowed = 0.0
             if activation > 0.0 and activation >= march.observed_activation:
                 is_known = True
                 width = march.fixed_width_m if march.fixed_width_m > 0 else weighted / activation
                 z = moderated(mean, var, activation, march.residual_var, march.mean_moderation)
                 if not math.isnan(lean):
-                    solid = min(max(lean, 0.0), 1.0) if mean < 0.0 else 0.0
-                    full = ROOM + (ROOM_IN_SOLID - ROOM) * solid
-                    z = lean + min((activation - march.observed_activation) / full, 1.0) * z
+                    if not march.evidence_only:
+                        solid = min(max(lean, 0.0), 1.0) if mean < 0.0 else 0.0
+                        full = ROOM + (ROOM_IN_SOLID - ROOM) * solid
+                        borrowed = 1.0 - min((activation - march.observed_activation) / full, 1.0)
+                    z = lean + (1.0 - borrowed) * z
                 rate = _softplus(z) / width
             else:
                 is_known = False
                 rate = march.unknown_rate
                 if march.unknown_width_m > 0 and not math.isnan(lean):
                     rate = _softplus(lean) / march.unknown_width_m
+                    borrowed = 1.0
                 if math.isnan(unknown_range):
                     unknown_range = r
             if rate == np.inf:
@@ -330,6 +338,7 @@ def _march(first, last, rays, n_steps, block, march, index, widths, room, out, q
             stopped, piece, inner = _step(rate, h)
             length += survival * piece
             moment += survival * (r * piece + inner)
+            borrowed_length += borrowed * survival * piece
             if not is_known:
                 unknown_length += survival * piece
             hazard += passed
@@ -343,5 +352,6 @@ def _march(first, last, rays, n_steps, block, march, index, widths, room, out, q
         out[3, i] = unknown_range
         if length > 0.0:
             out[4, i] = unknown_length / length
+            out[5, i] = borrowed_length / length
         else:  # it begins in unobserved space that stops it
             out[4, i] = 1.0

@@ -262,18 +262,19 @@ def examples() -> dict[str, m.Message]:
         )
     )
     add(m.RaysQuery(origins=rays, directions=ways, max_range_m=25.0), "minimal")
-    add(
-        m.Rays(
-            hit_probability=_f4([0.96875, 0.25]),
-            mean_m=_f4([7.5, 21.25]),
-            std_m=_f4([0.375, 6.5]),
-            quantile_m=_f4([[7.25, 7.5], [25.0, 25.0]]),
-            unknown_range_m=_f4([math.nan, 8.0]),
-            unknown_share=_f4([0.0, 0.625]),
-            step_m=0.125,
-            map_revision=31,
-        )
+    add(m.RaysQuery(origins=rays, directions=ways, max_range_m=25.0, evidence_only=True), "evidence_only")
+    returns = m.Rays(
+        hit_probability=_f4([0.96875, 0.25]),
+        mean_m=_f4([7.5, 21.25]),
+        std_m=_f4([0.375, 6.5]),
+        quantile_m=_f4([[7.25, 7.5], [25.0, 25.0]]),
+        unknown_range_m=_f4([math.nan, 8.0]),
+        unknown_share=_f4([0.0, 0.625]),
+        step_m=0.125,
+        map_revision=31,
     )
+    add(returns)
+    add(msgspec.structs.replace(returns, borrowed_share=_f4([0.0, 0.5])), "borrowed")
     path = _f8(
         [
             [[1.0, 0.0, 0.0, x], [0.0, 1.0, 0.0, 2.0], [0.0, 0.0, 1.0, 0.25], [0.0, 0.0, 0.0, 1.0]]
@@ -293,19 +294,20 @@ def examples() -> dict[str, m.Message]:
         )
     )
     add(m.RiskQuery(path=path, spheres=body), "minimal")
-    add(
-        m.Risk(
-            max_probability=_f4([0.0625, 0.75]),
-            union_probability=_f4([0.125, 0.875]),
-            unknown_share=_f4([0.0, 0.25]),
-            path_max_probability=0.75,
-            path_union_probability=0.9375,
-            path_unknown_share=0.125,
-            n_cells=640,
-            resolution_m=0.125,
-            map_revision=31,
-        )
+    add(m.RiskQuery(path=path, spheres=body, evidence_only=True), "evidence_only")
+    risk = m.Risk(
+        max_probability=_f4([0.0625, 0.75]),
+        union_probability=_f4([0.125, 0.875]),
+        unknown_share=_f4([0.0, 0.25]),
+        path_max_probability=0.75,
+        path_union_probability=0.9375,
+        path_unknown_share=0.125,
+        n_cells=640,
+        resolution_m=0.125,
+        map_revision=31,
     )
+    add(risk)
+    add(msgspec.structs.replace(risk, borrowed_share=_f4([0.0, 0.25]), path_borrowed_share=0.125), "borrowed")
     add(m.ParamsQuery(lower=[-8.0, -8.0, -2.0], upper=[8.0, 8.0, 4.0], deadline_ms=1000.0))
     add(m.ParamsQuery(), "whole_map")
     add(m.ParamsPart(part=0, n_parts=2, map_revision=31, kernels=kernels))
@@ -412,6 +414,8 @@ def examples() -> dict[str, m.Message]:
     add(m.AtomsQuery(action=m.AtomsAction.REMOVE, atom_id="street-corner-03"), "remove")
     add(m.AtomList(atoms=[info]))
     add(m.AtomList(atoms=[]), "empty")
+    yard = m.PlaceInfo(name="yard", times_used=12, provenance={"scans": "40", "held_out_nll": "0.1875"})
+    add(m.AtomList(atoms=[], places=[yard]), "places")
     add(atom)
     add(m.AtomsChanged(atom_id="street-corner-03", n_atoms=33, persisted=True))
     add(m.AtomsChanged(atom_id="street-corner-03", n_atoms=32, persisted=False), "in_memory")

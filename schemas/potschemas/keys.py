@@ -13,6 +13,7 @@ from typing import NamedTuple
 DEFAULT_ROOT = "pot/v1"
 CONTROL_VERBS = ("save", "load", "clear", "drain", "merge", "forget")
 CHANGE_ATOMS = "atoms"  # `ctl/atoms`: not a verb of a map, but of the server's one dictionary
+LEARN = "learn"  # `ctl/learn`: likewise, from what a map's scans have taught
 RESERVED_MAP_IDS = ("srv",)  # `<root>/srv/...` belongs to the servers
 _ID = re.compile(r"[a-z0-9][a-z0-9_.-]{0,62}\Z")
 _ROOT_CHUNK = re.compile(r"[^/*$#?@\s][^/*$#?\s]*\Z")
@@ -87,7 +88,7 @@ class MapKeys(NamedTuple):
         return f"{self.root}/{self.map_id}/q/{op}"
 
     def control(self, verb: str) -> str:
-        """QUERY: one of `CONTROL_VERBS`, or `CHANGE_ATOMS`."""
+        """QUERY: one of `CONTROL_VERBS`, `CHANGE_ATOMS` or `LEARN`."""
         return f"{self.root}/{self.map_id}/ctl/{verb}"
 
     def robot_token(self, robot: str) -> str:

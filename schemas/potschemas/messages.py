@@ -328,6 +328,7 @@ class RaysQuery(Message, frozen=True, kw_only=True):
     width_m: Positive | None = None  # m, over which p counts as one trial; absent = the kernels' own
     step_m: Positive | None = None  # m, longest step of the summation; absent = fine enough
     deadline_ms: Positive | None = None  # ms from arrival; past it no work and no part begins
+    evidence_only: bool | Absent = ABSENT  # true: nothing is borrowed, what is not observed is unknown
 
 
 class Rays(Message, frozen=True, kw_only=True):
@@ -343,6 +344,7 @@ class Rays(Message, frozen=True, kw_only=True):
     unknown_share: Array  # (N,) float32, of the ray's expected length, in unobserved space
     step_m: Positive  # m, the longest step that was taken
     map_revision: Count  # all answers are of this one
+    borrowed_share: Array | Absent = ABSENT  # (N,) float32, of it: what is expected, not seen; absent = 0
 
 
 class RiskQuery(Message, frozen=True, kw_only=True):
@@ -357,6 +359,7 @@ class RiskQuery(Message, frozen=True, kw_only=True):
     correlation_m: Positive | None = None  # m, edge of a cube that is one trial; absent = the kernels' own
     dims: Dims = 3  # 2 = the spheres are discs in the plane z = 0
     deadline_ms: Positive | None = None  # ms from arrival; past it no work and no part begins
+    evidence_only: bool | Absent = ABSENT  # true: nothing is borrowed, what is not observed is unknown
 
 
 class Risk(Message, frozen=True, kw_only=True):
@@ -377,6 +380,8 @@ class Risk(Message, frozen=True, kw_only=True):
     n_cells: Count  # of the swept volume
     resolution_m: Positive  # m, edge of a cell
     map_revision: Count  # all answers are of this one
+    borrowed_share: Array | Absent = ABSENT  # (P,) float32, of them: what is expected, not seen; absent = 0
+    path_borrowed_share: Probability | Absent = ABSENT  # of the swept volume's; absent = 0
 
 
 class ParamsQuery(Message, frozen=True, kw_only=True):
@@ -495,12 +500,21 @@ class AtomInfo(msgspec.Struct, frozen=True, kw_only=True):
     provenance: dict[str, str]  # source, scan, sector, licence, learner, held-out scores
 
 
+class PlaceInfo(msgspec.Struct, frozen=True, kw_only=True):
+    """What a place has taught the dictionary, see `ctl/learn`."""
+
+    name: str  # as it was learned
+    times_used: Count  # scans that leaned on it since the server started
+    provenance: dict[str, str]  # how many scans, the newest stamp, held-out NLL before and with it
+
+
 class AtomList(Message, frozen=True, kw_only=True):
     """The reply to an `AtomsQuery` that reads, without an id."""
 
     schema: ClassVar[str] = "pot.atom_list.v1"
 
     atoms: list[AtomInfo]  # in dictionary order
+    places: list[PlaceInfo] | Absent = ABSENT  # that the dictionary has grown by; absent = none
 
 
 class Atom(Message, frozen=True, kw_only=True):

@@ -17,6 +17,7 @@ from potserver.atoms.learning import LearningSettings
 from potserver.errors import SettingsError
 from potserver.evaluation.mappers import Answer
 from potserver.evaluation.paper import mass, rivalry
+from potserver.evaluation.paper.icp import icp
 from potserver.evaluation.paper.rivals import AbhmPipeline, BhmPipeline
 from potserver.evaluation.paper.scenes import (
     KITTI,
@@ -34,7 +35,8 @@ from potserver.evaluation.paper.table import Cell, Found, Lab, Results, Shown, T
 from potserver.evaluation.paper.tables import TABLES
 from potserver.evaluation.paper.trial import fitted, scored
 from potserver.numerics.coupling import couple
-from potserver.numerics.displacement import barycentric_images
+from potserver.numerics.displacement import OutOfSample, barycentric_images, carry
+from potserver.numerics.geometry import rotation_z
 from potserver.recordings import to_scan
 from tests.conformance import reference
 
@@ -198,6 +200,20 @@ def test_partial_transport_moves_a_share(clouds) -> None:
     total = 2.0 - 0.7  # of both, before the bins are taken off
     assert found.plan.sum() * total == pytest.approx(0.7, abs=0.03)
     assert (found.plan.sum(axis=1) > 0).all()
+
+
+def test_icp_finds_a_turn_and_follows_no_stretch(clouds) -> None:
+    x, _ = clouds
+    options = {"reg": 0.002, "tolerance": 1e-3, "max_iterations": 100}
+    turn = rotation_z(0.1)
+    turned = (x @ turn.T).astype(np.float32)
+    found = icp(x, turned, **options)
+    assert found.converged
+    np.testing.assert_allclose(carry(x, x, turned, found, OutOfSample.RIGID), turned, atol=1e-5)
+    stretched = (x * [3, 1, 1]).astype(np.float32)
+    left = carry(x, x, stretched, icp(x, stretched, **options), OutOfSample.RIGID) - stretched
+    by_transport = carry(x, x, stretched, couple(x, stretched, **options), OutOfSample.NEAREST) - stretched
+    assert np.square(left).mean() > 3.0 * np.square(by_transport).mean()
 
 
 def _scans(n: int) -> list:

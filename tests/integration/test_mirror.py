@@ -140,6 +140,12 @@ def test_a_map_that_leans_is_mirrored_with_its_lean(site: Site) -> None:
         assert not own.borrowed.any()
         assert (own.mean[~own.observed] == 0.5).all()
         np.testing.assert_allclose(mirror.occupancy(points, evidence_only=True).mean, own.mean, atol=0.02)
+        for alone in (False, True):
+            rays = site.client.rays(pose[:3, 3], points - pose[:3, 3], 9.0, evidence_only=alone)
+            risk = site.client.risk(pose, [0, 0, 0, 2.0], unknown="prior", evidence_only=alone)
+            assert rays.borrowed_share.any() != alone
+            assert (risk.path_borrowed_share > 0.0) != alone
+            assert risk.borrowed_share[0] == pytest.approx(risk.path_borrowed_share, abs=1e-6)
     assert mirror.update().is_empty
     assert "not_leaning.no_ground" not in site.client.stats().counters
     wall = np.column_stack([np.full(500, 6.0), rng.uniform(-6, 6, 500), rng.uniform(1, 5, 500)])

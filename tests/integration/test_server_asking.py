@@ -55,13 +55,17 @@ def risk_query(**changes: Any) -> messages.RiskQuery:
 
 @pytest.mark.parametrize("unknown", ["occupied", "free", "prior"])
 def test_rays_are_what_the_map_says(map_client: MapClient, real_server: MapServer, unknown: str) -> None:
-    answer = map_client.rays(np.zeros(3), DIRECTIONS, 9.0, quantiles=[0.25, 0.5], unknown=unknown)
+    answer = map_client.rays(
+        np.zeros(3), DIRECTIONS, 9.0, quantiles=[0.25, 0.5], unknown=unknown, step_m=0.1, width_m=0.4
+    )
     asked = Rays(
         np.zeros((40, 3)),
         DIRECTIONS.astype(np.float32),
         9.0,
         quantiles=[0.25, 0.5],
         unknown=Unknown(unknown),
+        step_m=0.1,
+        width_m=0.4,
     )
     plan = asked.plan(snapshot(real_server), Limits())
     expected = plan.result(plan.parts())

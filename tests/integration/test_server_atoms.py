@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from potclient import Atom, AtomRefusedError, MapClient, ReadOnlyError, UnknownAtomError
-from potclient.errors import InternalError, ShapeError
+from potclient.errors import InternalError, MapServerError, ShapeError
 from potserver.config import load_settings
 from potserver.domain.dictionary import AtomDictionary
 from potserver.server import MapServer
@@ -253,3 +253,58 @@ def test_changes_while_clouds_come_in_lose_nothing(serve: Serve, site: Path) -> 
     assert served
     assert served <= set(expected)
     assert sum(info.times_used for info in client.atoms()) > 0
+
+
+def street(x_m: float) -> tuple[np.ndarray, np.ndarray]:
+    """A scan of a made-up place that no dictionary knows: a level floor, and posts of 4 m on a lattice of 3 m; and its pose."""
+    azimuth, elevation = np.meshgrid(
+        np.linspace(-np.pi, np.pi, 360, endpoint=False), np.radians(np.arange(-30, 31, 2))
+    )
+    ways = np.stack(
+        [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)], axis=-1
+    ).reshape(-1, 3)
+    along = np.arange(0.3, 14.0, 0.05)
+    with np.errstate(divide="ignore"):
+        floor_m = np.where(ways[:, 2] < 0, -1.2 / ways[:, 2], np.inf)
+    places = ways[:, None, :2] * along[:, None] + [x_m, 1.5]
+    in_post = (np.abs((places + 1.5) % 3.0 - 1.5) < 0.3).all(axis=2) & (ways[:, 2:] * along < 2.8)
+    post_m = np.where(in_post.any(axis=1), along[in_post.argmax(axis=1)], np.inf)
+    range_m = np.minimum(floor_m, post_m)
+    seen = range_m < 14.0
+    pose = np.eye(4)
+    pose[0, 3] = x_m
+    return (ways[seen] * range_m[seen, None]).astype(np.float32), pose
+
+
+def test_a_server_learns_the_place_that_it_maps(serve: Serve, site: Path) -> None:
+    client = serve(dictionary=str(site), atoms__save=True)
+    assert client.places() == []
+    with pytest.raises(AtomRefusedError) as refused:
+        client.learn("yard")
+    assert refused.value.reason == "too_few_scans"
+    for number in range(8):
+        points, pose = street(0.8 * number)
+        client.integrate(points, pose, stamp_ns=number + 1)
+    assert "yard learned from 8 scans, saved" in client.learn("yard").message
+    (place,) = client.places()
+    assert (place.name, place.times_used, place.provenance["newest_stamp_ns"]) == ("yard", 0, "8")
+    points, pose = street(40.0)
+    receipt = client.integrate(points, pose)
+    assert receipt.kernels is not None
+    assert client.places()[0].times_used == 1
+    assert client.stats().counters["atoms.learned"] == 1
+    assert [one.name for one in AtomDictionary.load(site).grown] == ["yard"]
+    with pytest.raises(MapServerError, match="name"):
+        client.control("learn")
+    client.forget("r1")
+    with pytest.raises(AtomRefusedError, match="too few"):
+        client.learn("yard")
+    client.remove_atom("yard")
+    assert client.places() == []
+
+
+def test_a_server_that_takes_no_changes_learns_nothing(serve: Serve, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delitem(FAST, "atoms.writable")
+    client = serve()
+    with pytest.raises(ReadOnlyError):
+        client.learn("yard")

@@ -7,8 +7,12 @@ import pytest
 
 from potclient.metrics import score
 from potclient.towns import TownRecording
-from potserver.domain.dictionary import AtomDictionary
-from potserver.domain.types import Scan, yaw_pose
+from potserver.asking.rays import Rays
+from potserver.asking.risk import Risk
+from potserver.domain.atom_file import Learned
+from potserver.domain.dictionary import EXPECTATION, AtomDictionary
+from potserver.domain.types import Scan, Unknown, yaw_pose
+from potserver.limits import Limits
 from potserver.mapping import leaning
 from potserver.mapping.service import MappingService
 from potserver.recordings import Reader, open_recording, to_scan
@@ -71,6 +75,55 @@ def test_evidence_only_borrows_nothing(street: TownRecording) -> None:
     assert (answer.mean[~own.observed] != 0.5).mean() > 0.9
     sure = answer.observed & (answer.borrowed == 0.0)
     np.testing.assert_allclose(answer.mean[sure], own.mean[sure], rtol=1e-6)
+
+
+@pytest.mark.parametrize("evidence_only", [False, True])
+def test_rays_and_risk_borrow_what_points_borrow(street: TownRecording, evidence_only: bool) -> None:
+    thin, _ = few_rings(street, 5, 4)
+    snapshot = mapped(EXPECTING, thin).snapshot
+    rng = np.random.default_rng(2)
+    ways = rng.normal(size=(40, 3)) * [1.0, 1.0, 0.1]
+    ways /= np.linalg.norm(ways, axis=1, keepdims=True)
+    asked = Rays(
+        np.tile(thin.origin, (40, 1)), ways, 16.0, width_m=0.4, step_m=0.1, evidence_only=evidence_only
+    )
+    plan = asked.plan(snapshot, Limits())
+    rays = plan.result(plan.parts())
+    middles = thin.origin + ways[:, None] * ((np.arange(160) + 0.5) * 0.1)[:, None]
+    points = snapshot.occupancy(middles.reshape(-1, 3), evidence_only=evidence_only)
+    hazard = np.cumsum(-np.log1p(-points.mean.reshape(40, -1)) / 0.4 * 0.1, axis=1)
+    survival = np.exp(-np.column_stack([np.zeros(40), hazard]))
+    length = (survival[:, :-1] - survival[:, 1:]) / np.diff(hazard, axis=1, prepend=0.0) * 0.1
+    borrowed = (length * points.borrowed.reshape(40, -1)).sum(axis=1) / length.sum(axis=1)
+    np.testing.assert_allclose(rays.mean_m, length.sum(axis=1), atol=0.02)
+    np.testing.assert_allclose(rays.borrowed_share, borrowed, atol=0.01)
+    way = np.tile(np.eye(4), (5, 1, 1))
+    way[:, :3, 3] = middles[0, :100:20]
+    for unknown in Unknown:
+        told = Risk(way, [[0, 0, 0, 0.5]], unknown=unknown, evidence_only=evidence_only).plan(
+            snapshot, Limits()
+        )
+        risk = told.result(told.parts())
+        cells = snapshot.occupancy((told.swept.cells + 0.5) * risk.resolution_m, evidence_only=evidence_only)
+        counts = cells.borrowed * (cells.observed | (unknown is Unknown.PRIOR))
+        assert risk.path_borrowed_share == pytest.approx(counts.mean(), abs=1e-5)
+        assert risk.borrowed_share.max() >= risk.path_borrowed_share
+        assert (risk.path_borrowed_share > 0.0) == (not evidence_only)
+    assert rays.borrowed_share.max() > 0.05 or evidence_only
+    assert not (evidence_only and rays.borrowed_share.any())
+
+
+def test_what_foretells_a_scan_best_speaks(street: TownRecording) -> None:
+    net = AtomDictionary.builtin().expectation
+    assert net is not None
+    wrong = net._replace(last=-net.last, last_bias=-net.last_bias)
+    scan = to_scan(street[5], 5)
+    for base, other, name in ((wrong, net, "other"), (net, wrong, EXPECTATION)):
+        both = AtomDictionary(expectation=base, grown=[Learned("other", other, {})])
+        update = MappingService(both, threads=1).integrate(scan)
+        assert [borrowed.name for borrowed in update.own.borrowed] == [name]
+    neither = AtomDictionary(expectation=wrong, grown=[Learned("other", wrong, {})])
+    assert MappingService(neither, threads=1).integrate(scan).not_leaning == leaning.NOVEL
 
 
 def test_with_more_evidence_less_is_borrowed(street: TownRecording) -> None:

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from potserver.numerics.coupling import couple
-from potserver.numerics.displacement import OutOfSample, barycentric_images, carry
+from potserver.numerics.displacement import OutOfSample, barycentric_images, carry, rigid_map
+from potserver.numerics.geometry import rotation_z
 
 RNG = np.random.default_rng(0)
 # far apart, so that no entropy blurs one into the next
@@ -17,7 +18,7 @@ SHIFT = np.float32([0.5, -0.75, 0.25])
 KERNELS = RNG.uniform(-2, 10, (40, 3))
 
 
-@pytest.mark.parametrize("method", [OutOfSample.NEAREST, OutOfSample.LINEAR])
+@pytest.mark.parametrize("method", [OutOfSample.NEAREST, OutOfSample.LINEAR, OutOfSample.RIGID])
 def test_a_translation_moves_every_kernel_by_it(method: OutOfSample) -> None:
     target = (SOURCE + SHIFT)[::-1].copy()
     moved = carry(KERNELS, SOURCE, target, couple(SOURCE, target, reg=1e-4), method)
@@ -46,6 +47,16 @@ def test_nearest_uses_the_nearest_source_point_alone() -> None:
     kernels = np.stack([SOURCE[-1] + 0.3, SOURCE[0] + 0.3]).astype(np.float64)
     moved = carry(kernels, SOURCE, target, coupling, OutOfSample.NEAREST) - kernels
     np.testing.assert_allclose(moved, [[0, 0, 2], [0, 0, 0]], atol=2e-2)
+
+
+def test_a_rigid_map_turns_and_shifts_and_never_stretches_or_mirrors() -> None:
+    turn = rotation_z(0.4)
+    rotation, shift = rigid_map(SOURCE.astype(np.float64), SOURCE @ turn.T + SHIFT)
+    np.testing.assert_allclose(KERNELS @ rotation + shift, KERNELS @ turn.T + SHIFT, atol=1e-5)
+    for images in (2.0 * SOURCE, SOURCE * [1, 1, -1]):
+        rotation, _ = rigid_map(SOURCE.astype(np.float64), images.astype(np.float64))
+        np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-9)
+        assert np.linalg.det(rotation) > 0
 
 
 @pytest.mark.parametrize("method", list(OutOfSample))

@@ -109,7 +109,7 @@ def test_a_field_that_was_added_later_is_left_out_of_the_bytes_and_shown_with_an
         for field in msgspec.structs.fields(type(m))
         if field.default is messages.ABSENT and getattr(m, field.name) is messages.ABSENT
     }
-    assert len(later) == 24
+    assert len(later) == 30
     assert not any(later.values())
     given = {
         type(m) for m in examples().values() for kind, name in later if type(m) is kind and getattr(m, name)
@@ -174,7 +174,7 @@ def test_the_readme_has_every_key(readme: str) -> None:
         site.server_token("<server>"),
         keys.stats_key(keys.DEFAULT_ROOT, "<server>"),
         *(site.query(op) for op in QUESTIONS),
-        *(site.control(verb) for verb in (*keys.CONTROL_VERBS, keys.CHANGE_ATOMS)),
+        *(site.control(verb) for verb in (*keys.CONTROL_VERBS, keys.CHANGE_ATOMS, keys.LEARN)),
     }
     table = readme.split("## Keys")[1].split("\n## ")[0]
     assert set(re.findall(r"^\| `(@?pot/[^`]+)` \|", table, re.MULTILINE)) == expected

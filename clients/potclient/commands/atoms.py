@@ -19,6 +19,7 @@ from potclient.commands.shared import (
     table,
     write_json,
 )
+from potclient.questions.control import CONTROL_TIMEOUT_S
 from potschemas import messages
 
 
@@ -27,7 +28,7 @@ def add(commands: Any) -> None:
         commands,
         "atoms",
         run,
-        help="the dictionary of atoms: list, get, add, remove",
+        help="the dictionary of atoms: list, get, add, remove, learn",
         description="""List the dictionary's atoms with how often each has served, fetch one whole, or change the dictionary.
 
 A change counts for all maps of the server, from their next scan on. The server refuses atoms that are unsound or that it has
@@ -36,7 +37,8 @@ already, and says why. A file holds one atom; `potserver atoms export` takes the
   potclient atoms
   potclient atoms get terraces-180-s4 -o terraces-180-s4.atom
   potclient atoms add terraces-180-s4.atom corner.atom
-  potclient atoms remove terraces-180-s4""",
+  potclient atoms remove terraces-180-s4
+  potclient atoms learn yard""",
     )
     add_json_argument(parser)
     verbs = parser.add_subparsers(title="verbs", metavar="VERB", dest="verb")
@@ -70,6 +72,13 @@ already, and says why. A file holds one atom; `potserver atoms export` takes the
         description="Take atoms out of the dictionary. The kernels that maps have from them stay.",
     )  # fmt: skip
     remove.add_argument("names", nargs="+", metavar="ID")
+    learn = add_verb(
+        verbs, "learn", _learn, timeout_s=CONTROL_TIMEOUT_S, help="from the scans that a map has taken",
+        description="Let the dictionary grow by what a map's scans have taught. It is refused if what is known does as well.",
+    )  # fmt: skip
+    learn.add_argument(
+        "name", metavar="NAME", help="of the place; what was learned under it goes on learning"
+    )
     for verb in (listing, get, put, remove):
         add_json_argument(verb)
 
@@ -78,14 +87,17 @@ def run(arguments: argparse.Namespace) -> int:
     with client_of(arguments) as client:
         if arguments.verb == "get":
             atom = client.atom(arguments.atom_id)
-            atoms = [atom.info]
+            atoms, places = [atom.info], []
             if arguments.out is not None:
                 atom.save(arguments.out)
         else:
-            atoms = client.atoms()
+            atoms, places = client.atoms(), client.places()
     write_json(arguments.json, [plain(atom) for atom in atoms])
     if arguments.json != "-":
         _say_atoms(atoms)
+        for place in places:
+            noted = ", ".join(f"{key} {value}" for key, value in sorted(place.provenance.items()))
+            say(f"learned from {place.name}, used by {place.times_used} scans: {noted}")
         if arguments.verb == "get":
             say("\n".join(f"{key}: {value}" for key, value in sorted(atoms[0].provenance.items())))
     return EXIT_OK
@@ -106,6 +118,13 @@ def _change_atoms(arguments: argparse.Namespace) -> int:
                     say(f"{change.atom_id} {done}, {change.n_atoms} atoms, {kept}")
         finally:
             write_json(arguments.json, [plain(change) for change in changes])
+    return EXIT_OK
+
+
+def _learn(arguments: argparse.Namespace) -> int:
+    with client_of(arguments) as client:
+        reply = client.learn(arguments.name, timeout_s=arguments.timeout)
+    say(reply.message)
     return EXIT_OK
 
 

@@ -13,6 +13,7 @@ from potclient.commands.shared import (
     EXIT_OK,
     add_box_arguments,
     add_command,
+    add_evidence_only_argument,
     client_of,
     part_bar,
     positive,
@@ -37,9 +38,7 @@ def add(commands: Any) -> None:
     )
     add_box_arguments(parser, "corner of the box, m, map frame")
     parser.add_argument("--resolution", type=positive, required=True, metavar="METRES", help="cell edge")
-    parser.add_argument(
-        "--evidence-only", action="store_true", help="borrow nothing from what the dictionary expects"
-    )
+    add_evidence_only_argument(parser)
     parser.add_argument(
         "-o",
         "--out",

@@ -14,6 +14,7 @@ from potclient.commands.output_files import output_file
 from potclient.commands.shared import (
     EXIT_OK,
     add_command,
+    add_evidence_only_argument,
     add_json_argument,
     client_of,
     read_table,
@@ -47,9 +48,7 @@ log-odds with theirs, whether the map has seen anything near, and which share of
         "--file", type=Path, metavar="FILE", help=".npy of shape (N, 3) or (N, 2), or text rows of x y z"
     )
     parser.add_argument("--gradient", action="store_true", help="gradients of probability and log-odds too")
-    parser.add_argument(
-        "--evidence-only", action="store_true", help="borrow nothing from what the dictionary expects"
-    )
+    add_evidence_only_argument(parser)
     parser.add_argument("-o", "--out", type=output_file, metavar="FILE", help="write all answers to an .npz")
     add_json_argument(parser)
 

@@ -14,6 +14,7 @@ from potclient.commands.output_files import output_file
 from potclient.commands.shared import (
     EXIT_OK,
     add_command,
+    add_evidence_only_argument,
     add_json_argument,
     add_unknown_argument,
     client_of,
@@ -27,7 +28,15 @@ from potclient.errors import UsageError
 from potclient.files import save_npz
 from potclient.questions.rays import Rays
 
-_ARRAYS = ("hit_probability", "mean_m", "std_m", "quantile_m", "unknown_range_m", "unknown_share")
+_ARRAYS = (
+    "hit_probability",
+    "mean_m",
+    "std_m",
+    "quantile_m",
+    "unknown_range_m",
+    "unknown_share",
+    "borrowed_share",
+)
 _SHOWN = 40  # answers in the table
 
 
@@ -62,6 +71,7 @@ constant P stops the ray with probability P. Ranges are of the first return, or 
         "--quantiles", type=float, nargs="+", default=[0.05, 0.5, 0.95], metavar="Q", help="ascending"
     )
     add_unknown_argument(parser, "prior")
+    add_evidence_only_argument(parser)
     parser.add_argument(
         "--width", type=positive, metavar="METRES", help="over which P is one trial (default: the kernels')"
     )
@@ -81,6 +91,7 @@ def run(arguments: argparse.Namespace) -> int:
             unknown=arguments.unknown,
             width_m=arguments.width,
             step_m=arguments.step,
+            evidence_only=arguments.evidence_only,
         )
     arrays = {name: getattr(answer, name) for name in _ARRAYS}
     if arguments.out is not None:
@@ -117,11 +128,12 @@ def _say_rays(answer: Rays, directions: Float64) -> None:
             *[f"{q:.3f}" for q in answer.quantile_m[i]],
             "-" if math.isnan(answer.unknown_range_m[i]) else f"{answer.unknown_range_m[i]:.3f}",
             f"{answer.unknown_share[i]:.1%}",
+            f"{answer.borrowed_share[i]:.1%}",
         ]
         for i in range(min(len(answer), _SHOWN))
     ]
     heads = ["dx", "dy", "dz", "P(return)", "mean m", "std m", *[f"q{q:g} m" for q in answer.quantiles]]
-    say_rows([*heads, "unknown from m", "unknown"], rows, len(answer), "-o FILE or --json FILE")
+    say_rows([*heads, "unknown from m", "unknown", "borrowed"], rows, len(answer), "-o FILE or --json FILE")
     say(f"map revision {answer.revision}, steps of {answer.step_m:.3g} m")
 
 

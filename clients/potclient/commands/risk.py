@@ -12,6 +12,7 @@ from potclient.arrays import Float64
 from potclient.commands.shared import (
     EXIT_OK,
     add_command,
+    add_evidence_only_argument,
     add_json_argument,
     add_unknown_argument,
     client_of,
@@ -23,11 +24,12 @@ from potclient.commands.shared import (
 )
 from potclient.poses import yaw_pose
 
-_ARRAYS = ("max_probability", "union_probability", "unknown_share")
+_ARRAYS = ("max_probability", "union_probability", "unknown_share", "borrowed_share")
 _TOTALS = (
     "path_max_probability",
     "path_union_probability",
     "path_unknown_share",
+    "path_borrowed_share",
     "n_cells",
     "resolution_m",
     "revision",
@@ -67,6 +69,7 @@ The path is a text file with, in each row, x y z, or x y z yaw with the yaw in r
         help="centre in the body frame and radius, m; may be repeated",
     )
     add_unknown_argument(parser, "occupied")
+    add_evidence_only_argument(parser)
     parser.add_argument(
         "--resolution", type=positive, metavar="METRES", help="cell edge (default: half the smallest radius)"
     )
@@ -87,6 +90,7 @@ def run(arguments: argparse.Namespace) -> int:
             resolution_m=arguments.resolution,
             correlation_m=arguments.correlation,
             dims=2 if arguments.planar else 3,
+            evidence_only=arguments.evidence_only,
         )
     arrays = {name: getattr(answer, name).tolist() for name in _ARRAYS}
     write_json(arguments.json, {name: getattr(answer, name) for name in _TOTALS} | arrays)
@@ -99,13 +103,15 @@ def run(arguments: argparse.Namespace) -> int:
             f"{answer.max_probability[i]:.4f}",
             f"{answer.union_probability[i]:.4f}",
             f"{answer.unknown_share[i]:.1%}",
+            f"{answer.borrowed_share[i]:.1%}",
         ]
         for i in range(min(len(path), _SHOWN))
     ]
-    say_rows(["pose", "x", "y", "z", "max", "union", "unknown"], rows, len(path), "--json FILE")
+    say_rows(["pose", "x", "y", "z", "max", "union", "unknown", "borrowed"], rows, len(path), "--json FILE")
     say(
         f"path: max {answer.path_max_probability:.4f}, union {answer.path_union_probability:.4f}, "
-        f"{answer.path_unknown_share:.1%} unknown of {answer.n_cells} cells of {answer.resolution_m:g} m, "
+        f"{answer.path_unknown_share:.1%} unknown and {answer.path_borrowed_share:.1%} borrowed "
+        f"of {answer.n_cells} cells of {answer.resolution_m:g} m, "
         f"revision {answer.revision}"
     )
     return EXIT_OK

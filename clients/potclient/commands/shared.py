@@ -107,7 +107,14 @@ def add_unknown_argument(parser: argparse.ArgumentParser, default: str) -> None:
         "--unknown",
         choices=[kind.value for kind in messages.Unknown],
         default=default,
-        help=f"what unobserved space is taken for (default {default}; prior = 0.5)",
+        help=f"what unobserved space is taken for (default {default}; prior = what is expected there, or 0.5)",
+    )
+
+
+def add_evidence_only_argument(parser: argparse.ArgumentParser) -> None:
+    """Add `--evidence-only`."""
+    parser.add_argument(
+        "--evidence-only", action="store_true", help="borrow nothing from what the dictionary expects"
     )
 
 

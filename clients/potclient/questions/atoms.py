@@ -5,13 +5,19 @@ from __future__ import annotations
 from potclient.atoms import Atom
 from potclient.link import Link
 from potschemas.keys import CHANGE_ATOMS
+from potschemas.messages import ABSENT, AtomInfo, AtomList, AtomsAction, AtomsChanged, AtomsQuery, PlaceInfo
 from potschemas.messages import Atom as AtomMessage
-from potschemas.messages import AtomInfo, AtomList, AtomsAction, AtomsChanged, AtomsQuery
 
 
 def atoms(link: Link, timeout_s: float | None) -> list[AtomInfo]:
     """See `MapClient.atoms`."""
     return link.ask(link.keys.query("atoms"), AtomsQuery(), AtomList, timeout_s).atoms
+
+
+def places(link: Link, timeout_s: float | None) -> list[PlaceInfo]:
+    """See `MapClient.places`."""
+    told = link.ask(link.keys.query("atoms"), AtomsQuery(), AtomList, timeout_s).places
+    return [] if told is ABSENT else told
 
 
 def atom(link: Link, atom_id: str, timeout_s: float | None) -> Atom:

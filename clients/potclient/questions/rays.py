@@ -32,6 +32,7 @@ class Rays:
     quantile_m: Float32  # (N, Q); the maximum range, where a return before it is too unlikely
     unknown_range_m: Float32  # (N,) where the ray first enters unobserved space; NaN: nowhere before it ends
     unknown_share: Float32  # (N,) of the ray's expected length, in unobserved space
+    borrowed_share: Float32  # (N,) of it: the share of the answers there that is expected, and not evidence
     quantiles: tuple[float, ...]  # the Q that were asked for
     step_m: float  # the longest step that was taken
     revisions: tuple[int, ...] = (0,)  # as in `Occupancy`
@@ -52,13 +53,21 @@ class Rays:
             BadReplyError: it does not hold n answers of the promised dtypes.
         """
         shapes = dict.fromkeys(_FIELDS, (n,)) | {"quantile_m": (n, len(quantiles))}
-        arrays = arrays_of(message, "rays", shapes)
-        return cls(**arrays, quantiles=quantiles, step_m=message.step_m, revisions=(message.map_revision,))
+        borrowed = np.zeros(n, np.float32)
+        if message.borrowed_share is not messages.ABSENT:
+            borrowed = arrays_of(message, "rays", {"borrowed_share": (n,)})["borrowed_share"]
+        return cls(
+            **arrays_of(message, "rays", shapes),
+            borrowed_share=borrowed,
+            quantiles=quantiles,
+            step_m=message.step_m,
+            revisions=(message.map_revision,),
+        )
 
     @staticmethod
     def concatenate(parts: list[Rays]) -> Rays:
         """All answers in order, all revisions that gave them, and the longest step."""
-        names = (*_FIELDS, "quantile_m")
+        names = (*_FIELDS, "quantile_m", "borrowed_share")
         arrays: dict[str, Any] = {name: np.concatenate([getattr(p, name) for p in parts]) for name in names}
         return Rays(
             **arrays,
@@ -75,8 +84,9 @@ class RayOptions:
     max_range_m: float
     quantiles: Sequence[float]
     unknown: messages.Unknown | str
-    width_m: float | None
-    step_m: float | None
+    evidence_only: bool
+    width_m: float | None = None
+    step_m: float | None = None
 
 
 def rays(
@@ -100,6 +110,7 @@ def rays(
         width_m=positive_or_none(options.width_m, "width_m"),
         step_m=positive_or_none(options.step_m, "step_m"),
         deadline_ms=link.deadline_ms(timeout_s),
+        evidence_only=True if options.evidence_only else messages.ABSENT,
     )
     parts: list[Rays] = []
     first, step = 0, min(max(len(ways), 1), _CHUNK_RAYS)

@@ -51,7 +51,13 @@ def _plan_read(asked: Asked, query: messages.AtomsQuery) -> Single:
     atom_id = query.atom_id
     if atom_id is None:
         return Single(
-            lambda: messages.AtomList(atoms=[encode_atom_info(atom, usage) for atom in dictionary]),
+            lambda: messages.AtomList(
+                atoms=[encode_atom_info(atom, usage) for atom in dictionary],
+                places=[
+                    messages.PlaceInfo(name=one.name, times_used=usage[one.name], provenance=one.provenance)
+                    for one in dictionary.grown
+                ],
+            ),
             is_short=True,
         )
     return Single(lambda: encode_atom(dictionary.get(atom_id), usage, asked.snapshot.rule), is_short=True)

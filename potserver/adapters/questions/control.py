@@ -1,10 +1,11 @@
-"""`ctl/<verb>` of one map. Each follows every cloud that was admitted before it; `ctl/atoms` is of the dictionary."""
+"""`ctl/<verb>` of one map. Each follows every cloud that was admitted before it; `ctl/atoms` and `ctl/learn` wait for none."""
 
 from __future__ import annotations
 
 import dataclasses
 import time
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import zenoh
@@ -15,8 +16,8 @@ from potserver.adapters.intake import Barrier, IntakeQueue
 from potserver.adapters.key_exprs import is_wild, last_chunk
 from potserver.adapters.outbox import Outbox
 from potserver.adapters.queryable import Queryable
-from potserver.adapters.questions import atoms
-from potserver.adapters.questions.question import Served
+from potserver.adapters.questions import atoms, learn
+from potserver.adapters.questions.question import Question, Served
 from potserver.adapters.replies import asker_of, check_query, failure, payload_of, reply, reply_error
 from potserver.adapters.writer import MapWriter
 from potserver.codec.base import decode, encode
@@ -79,7 +80,8 @@ VERBS = {
 }
 
 
-_ALL = (*VERBS, keys.CHANGE_ATOMS)
+_OF_DICTIONARY: dict[str, Question[Any]] = {keys.CHANGE_ATOMS: atoms.CHANGE, keys.LEARN: learn.LEARN}
+_ALL = (*VERBS, *_OF_DICTIONARY)
 
 
 def work_of(verb: str, request: messages.ControlRequest, writer: MapWriter) -> Work:
@@ -118,7 +120,7 @@ class ControlQueryable(Queryable):
         Args:
             session, map_keys: Where.
             served: The map.
-            answers: `ctl/atoms`, which is about the dictionary and waits for no clouds.
+            answers: `ctl/atoms` and `ctl/learn`, which are about the dictionary and wait for no clouds.
             intake: Where the work waits for the clouds before it.
             writer: Whose thread does it.
             withdraw: Says that the map takes no more clouds.
@@ -136,8 +138,8 @@ class ControlQueryable(Queryable):
             raise UnsupportedError(
                 "control changes a map: name the map and the verb, wildcards are not taken"
             )
-        if verb == keys.CHANGE_ATOMS:
-            self._answers.submit(query, atoms.CHANGE, self._keys.control(verb), "control.atoms")
+        if verb in _OF_DICTIONARY:
+            self._answers.submit(query, _OF_DICTIONARY[verb], self._keys.control(verb), f"control.{verb}")
             return
         if verb not in VERBS:
             raise UnsupportedError(f"no verb {verb!r}; there are {', '.join(_ALL)}")

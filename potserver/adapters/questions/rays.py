@@ -27,6 +27,7 @@ def decode_rays(query: messages.RaysQuery) -> Rays:
         unknown=Unknown(query.unknown.value),
         width_m=query.width_m,
         step_m=query.step_m,
+        evidence_only=query.evidence_only is True,
     )
 
 

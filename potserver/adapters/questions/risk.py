@@ -27,6 +27,7 @@ def decode_risk(query: messages.RiskQuery) -> Risk:
         resolution_m=query.resolution_m,
         correlation_m=query.correlation_m,
         dims=query.dims,
+        evidence_only=query.evidence_only is True,
     )
 
 

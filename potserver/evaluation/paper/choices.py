@@ -7,6 +7,7 @@ from functools import partial
 from statistics import median
 
 from potserver.domain.dictionary import AtomDictionary
+from potserver.evaluation.paper.icp import icp
 from potserver.evaluation.paper.mass import MASS
 from potserver.evaluation.paper.scenes import Scene
 from potserver.evaluation.paper.table import Cell, Found, Lab, Shown, Table, show_rows
@@ -24,6 +25,7 @@ _EVEN = {
     "16 of 22.5 degrees": tuple(22.5 * k for k in range(16)),
     "24 of 15 degrees": tuple(15.0 * k for k in range(24)),
 }
+_SAMPLES = OutOfSample.NEAREST, OutOfSample.LINEAR, OutOfSample.ENTROPIC
 _EXACT_REG_M2 = 0.25  # next to none
 _MASS_POINTS = 250  # of each side: plain numpy is slow
 _MASS_REG = 0.005  # of the largest cost
@@ -100,7 +102,19 @@ def _rotation_cells(lab: Lab) -> list[Cell]:
 
 
 def _sample_cells(lab: Lab) -> list[Cell]:
-    return _variants(lab, {kind.value: _coupled(out_of_sample=kind) for kind in OutOfSample})
+    return _variants(lab, {kind.value: _coupled(out_of_sample=kind) for kind in _SAMPLES})
+
+
+def _alignment_cells(lab: Lab) -> list[Cell]:
+    rigid = OutOfSample.RIGID
+    return _variants(
+        lab,
+        {
+            "transport": PAPER,
+            "the transport's rigid part": _coupled(out_of_sample=rigid),
+            "ICP": _coupled(out_of_sample=rigid, solve=icp),
+        },
+    )
 
 
 def _mass_cells(lab: Lab) -> list[Cell]:
@@ -228,6 +242,8 @@ CHOICES = (
           _rotation_cells, _plain(("ranking ms", "match_ms", ".0f"))),
     Table("out-of-sample", "Out-of-sample maps", _NO_FIGURE + " It says linear, its code takes nearest.",
           "20", _sample_cells, _plain(("sectors served", "served", ".0%"))),
+    Table("alignment", "Transport and rigid alignment", _NO_FIGURE + " It says that ICP, unlike transport, takes no large and"
+          " non-rigid change.", "20", _alignment_cells, _plain(("sectors served", "served", ".0%"))),
     Table("ranking", "Scores of the ranking", _NO_FIGURE + " Eq. 7 is `w2`, its code does `normalised` at 12.5 m2.", "20",
           _rank_cells, _plain(("same choice as without blur", "same", ".0%"))),
     Table("mass", "Balanced, unbalanced and partial transport", _NO_FIGURE + " It is balanced.", "40", _mass_cells,
