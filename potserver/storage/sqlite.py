@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from potserver.errors import MapFileError, StorageError
-from potserver.storage.files import claim_file, disk_fault, disk_faults
+from potserver.storage.files import check_no_link, claim_file, disk_fault, disk_faults
 
 _PAGE_BYTES = 16_384  # values are of 10 to 300 kB
 _WAL_BYTES = 64 * 2**20  # to which a long log is cut back
@@ -21,6 +21,7 @@ _DISK_FAULTS = {
     "disk I/O error": "io",
     "unable to open": "permission",
     "permission denied": "permission",
+    "locking protocol": "io",  # a file system that cannot lock
 }
 
 
@@ -63,6 +64,7 @@ def connect(
         StorageError: it cannot be opened or written, or somebody else has it open.
     """
     claim_file(path)
+    check_no_link(log_of(path))
     with reading(path):
         connection = sqlite3.connect(
             path, isolation_level=None, check_same_thread=False, timeout=0.0 if exclusive else _BUSY_S
