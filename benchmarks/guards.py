@@ -129,7 +129,7 @@ GUARDS = (
         "        if n_bytes >= self._bounds.max_map_bytes:\n",
         "        if False:\n",
         "tests/integration/test_server_store.py",
-        "over_the_wire",
+        "full_map",
     ),
     Guard(
         "a full share of a map",
