@@ -266,3 +266,27 @@ def test_a_close_goes_on_where_another_thread_is_asking() -> None:
         assert not [thread for thread in before if thread.is_alive()]
         with pytest.raises(PotclientError):
             asked()
+
+
+def test_a_close_waits_for_whoever_is_inside_zenoh(map_server: MapServer) -> None:
+    entered, waited_for = threading.Event(), threading.Event()
+
+    class Told(threading.Condition):
+        def wait_for(self, predicate: Any, timeout: float | None = None) -> bool:
+            waited_for.set()
+            return super().wait_for(predicate, timeout)
+
+    def inside() -> None:
+        entered.set()
+        assert waited_for.wait(DEADLINE_S)
+
+    with MapClient(map_server.endpoint) as client:
+        link = client._link
+        link._calls_changed = Told()
+        called = in_background(lambda: link._call(inside))
+        assert entered.wait(DEADLINE_S)
+        client.close()
+        n_inside = link.n_calls
+        waited_for.set()
+        called()
+        assert n_inside == 0
