@@ -239,6 +239,23 @@ client.info()
     assert done.returncode == status, done.stderr
 
 
+def test_a_client_that_nobody_holds_any_more_is_closed_at_the_end(map_server: MapServer) -> None:
+    """Its threads went on inside Zenoh while the interpreter ended: one process in three was aborted."""
+    program = f"""
+import atexit, gc, threading
+atexit.register(lambda: print([t.name for t in threading.enumerate() if t.name.startswith("potclient-")]))
+from potclient import MapClient
+client = MapClient({map_server.endpoint!r})
+client.info()
+del client
+gc.collect()
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", program], timeout=2 * DEADLINE_S, capture_output=True, text=True, check=False
+    )
+    assert (done.returncode, done.stdout) == (0, "[]\n"), done.stderr
+
+
 class InUse:
     """A declaration that another thread is using: the library refuses to undeclare it."""
 

@@ -10,11 +10,13 @@ import sqlite3
 import stat
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from potserver.domain.map_state import MapState
 from potserver.errors import MapFileError, StorageError
+from potserver.storage import map_file
 from potserver.storage.agreement import JOURNAL, MARK, TILES
 from potserver.storage.journal import scans_after
 from potserver.storage.mark import read_mark
@@ -330,6 +332,47 @@ def test_what_the_disk_refuses_is_not_called_damaged(
     with pytest.raises(StorageError, match="nothing is wrong with the map") as caught, wrap(tmp_path / "f"):  # type: ignore[attr-defined]
         raise sqlite3.OperationalError(says)
     assert caught.value.reason == reason
+
+
+@pytest.mark.parametrize("says", ["database disk image is malformed", "file is not a database"])
+def test_a_file_that_the_disk_cannot_read_is_not_called_damaged(tmp_path: Path, says: str) -> None:
+    """SQLite does: to it a page that cannot be read is one that holds nonsense."""
+    file, mended = tmp_path / "f", tmp_path / "mended"
+    file.symlink_to("/proc/self/mem")  # whose first bytes are an I/O error
+    mended.write_bytes(b"nonsense")
+    with (
+        pytest.raises(StorageError, match=r"cannot read .* nothing is wrong with the map") as caught,
+        reading(file),
+    ):
+        raise sqlite3.DatabaseError(says)
+    assert caught.value.reason == "io"
+    log_of(mended).symlink_to("/proc/self/mem")
+    with pytest.raises(StorageError, match="cannot read"), reading(mended):
+        raise sqlite3.DatabaseError(says)
+    log_of(mended).unlink()
+    with pytest.raises(MapFileError, match="is damaged"), reading(mended):
+        raise sqlite3.DatabaseError(says)
+
+
+class FailingOnce(sqlite3.Connection):
+    """A disk that fails while the tiles are read: SQLite rolls back by itself then."""
+
+    def execute(self, sql: str, *values: Any) -> sqlite3.Cursor:
+        if sql.startswith("SELECT x, y, z, data"):
+            self.rollback()
+            raise sqlite3.OperationalError("disk I/O error")
+        return super().execute(sql, *values)
+
+
+def test_a_disk_that_fails_while_a_map_is_read_is_said_and_not_its_consequence(
+    killed: tuple[Path, MapState], tmp_path: Path
+) -> None:
+    file = copied(killed, tmp_path / "left") / TILES
+    with (
+        contextlib.closing(sqlite3.connect(file, factory=FailingOnce, isolation_level=None)) as connection,
+        pytest.raises(StorageError, match="disk I/O error"),
+    ):
+        map_file._read(connection, file, {}, None)
 
 
 def test_the_mark_names_what_was_acknowledged(tmp_path: Path, open_map: OpenMap) -> None:
