@@ -2,11 +2,13 @@
 
     python benchmarks/fairness.py --grids 8 --seconds 30
     python benchmarks/fairness.py --grids 8 --seconds 30 --faults
+    python benchmarks/fairness.py --grids 0 --beside rays rays risk risk params params tiles tiles
 
 `potserver serve` runs as a process of its own, and is fed some scans. Then every asker is a process with a session of its own:
 some ask for grids of 3.3 million cells again and again, one for 190,000 points, and one for 100 points, ten times a second.
 With `--faults` a robot sends clouds, sessions come and go, somebody sends hostile messages, and every other two seconds the
-disk refuses all that the server writes; or only some of that, by name.
+disk refuses all that the server writes; or only some of that, by name. `--beside` adds askers of the largest questions that
+a server takes: rays of 4 million steps, paths of 5,000 poses, all kernels, and what differs from 100,000 tiles.
 """
 
 from __future__ import annotations
@@ -35,7 +37,7 @@ from benchmarks.shared import keep, parser_of
 from benchmarks.torture_messages import OPS, config_of, mutated
 from potclient import MapClient, MapServerError, PotclientError
 from potclient.datasets import open_dataset
-from potschemas import wire
+from potschemas import messages, wire
 from potschemas.examples import examples
 
 _LOWER, _UPPER = np.array([-40.0, -40.0, -2.0]), np.array([40.0, 40.0, 6.0])
@@ -56,6 +58,7 @@ def main() -> int:
         choices=FAULTS,
         help="what goes wrong beside (default: nothing; without names: all)",
     )
+    parser.add_argument("--beside", nargs="+", choices=LARGE, default=[], help="more askers, one a name")
     parser.add_argument("--asker", choices=_ASKERS, help=argparse.SUPPRESS)
     parser.add_argument("--endpoint", help=argparse.SUPPRESS)
     options = parser.parse_args()
@@ -63,14 +66,16 @@ def main() -> int:
         _ask(options)
         return 0
     faults = () if options.faults is None else tuple(options.faults) or FAULTS
-    found = measure(options.grids, options.seconds, scans=options.scans, faults=faults)
+    found = measure(options.grids, options.seconds, scans=options.scans, faults=faults, beside=options.beside)
     for name, value in found.items():
         print(f"{name}: {value}")
     keep(options, found)
     return 0 if not found["points of 100"]["failed"] else 1
 
 
-def measure(grids: int, seconds: float, *, scans: int = 20, faults: Sequence[str] = ()) -> dict[str, Any]:
+def measure(
+    grids: int, seconds: float, *, scans: int = 20, faults: Sequence[str] = (), beside: Sequence[str] = ()
+) -> dict[str, Any]:
     """What every kind of asker met, and the server's counters."""
     flags = ("serve", "--listen", "tcp/127.0.0.1:0", "--log-format", "json", "--store")
     with tempfile.TemporaryDirectory() as folder, contextlib.closing(ServerProcess(*flags, folder)) as server:
@@ -83,18 +88,24 @@ def measure(grids: int, seconds: float, *, scans: int = 20, faults: Sequence[str
                 client.integrate(scan.points, scan.T_map_sensor, robot="r1", seq=number)
             info = client.info()
             alone = _run(endpoint, ["points"], min(seconds, 10.0))
-            askers = ["points", "many", *["grid"] * grids, *(name for name in faults if name in _ASKERS)]
+            askers = [
+                "points",
+                "many",
+                *["grid"] * grids,
+                *beside,
+                *(name for name in faults if name in _ASKERS),
+            ]
             with _disk_that_refuses(server.popen.pid) if "disk" in faults else contextlib.nullcontext():
-                beside = _run(endpoint, askers, seconds)
+                met = _run(endpoint, askers, seconds)
             counters = client.stats().counters
         server.end(signal.SIGTERM)
     return {
         "kernels": info.n_kernels,
         "points of 100, alone": alone["points"],
-        "points of 100": beside["points"],
-        "points of 190,000": beside["many"],
-        f"grids, {grids} askers": beside.get("grid"),
-        **{name: beside[name] for name in faults if name in beside},
+        "points of 100": met["points"],
+        "points of 190,000": met["many"],
+        f"grids, {grids} askers": met.get("grid"),
+        **{name: met[name] for name in (*dict.fromkeys(beside), *faults) if name in met},
         "server": {
             name: n for name, n in counters.items() if name.startswith(("queries.", "clouds.", "store."))
         },
@@ -159,6 +170,34 @@ def _points(client: MapClient, rng: np.random.Generator, _endpoint: str) -> None
     time.sleep(0.1)
 
 
+def _rays(client: MapClient, rng: np.random.Generator, _endpoint: str) -> None:
+    directions = rng.normal(size=(15_000, 3))
+    directions /= np.linalg.norm(directions, axis=1)[:, None]
+    client.rays(rng.uniform(-2.0, 2.0, (15_000, 3)), directions, 25.0, step_m=0.1)
+
+
+def _risk(client: MapClient, rng: np.random.Generator, _endpoint: str) -> None:
+    path = np.tile(np.eye(4), (5_000, 1, 1))
+    path[:, :3, 3] = np.linspace(
+        [-20.0, rng.uniform(-5.0, 5.0), 1.0], [20.0, rng.uniform(-5.0, 5.0), 1.0], 5_000
+    )
+    client.risk(path, [[x, 0.0, 0.0, 0.3] for x in np.linspace(-1.0, 1.0, 8)])
+
+
+def _params(client: MapClient, rng: np.random.Generator, _endpoint: str) -> None:
+    client.params()
+
+
+def _tiles(client: MapClient, rng: np.random.Generator, endpoint: str) -> None:
+    epoch = getattr(_tiles, "epoch", 0)
+    known = np.append(rng.integers(-10_000, 10_000, (3, 100_000)), np.ones((1, 100_000), np.int64), axis=0)
+    query = wire.encode(messages.TilesQuery(known=wire.pack_array(known), epoch=epoch))
+    for reply in _mallory(endpoint)[0].get(client.keys.query("tiles"), payload=query, timeout=_TIMEOUT_S):
+        if reply.ok is None:
+            raise MapServerError(str(reply.err))
+        _tiles.epoch = wire.decode(reply.ok.payload.to_bytes(), messages.TilesPart).epoch  # type: ignore[attr-defined]
+
+
 def _robot(client: MapClient, rng: np.random.Generator, _endpoint: str) -> None:
     points = rng.normal(size=(5000, 3)) * [8.0, 6.0, 0.5]
     with contextlib.suppress(MapServerError):  # the disk refused it: it says so
@@ -182,10 +221,15 @@ def _mallory(endpoint: str) -> tuple[zenoh.Session, list[bytes], random.Random]:
     return zenoh.open(config_of(endpoint)), golden, random.Random(0)
 
 
+LARGE = ("rays", "risk", "params", "tiles")
 _ASKERS: dict[str, Callable[[MapClient, np.random.Generator, str], None]] = {
     "grid": _grid,
     "many": _many,
     "points": _points,
+    "rays": _rays,
+    "risk": _risk,
+    "params": _params,
+    "tiles": _tiles,
     "robot": _robot,
     "churn": _churn,
     "hostile": _hostile,

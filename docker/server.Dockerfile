@@ -1,7 +1,11 @@
 # docker build -f docker/server.Dockerfile -t potserver:0.1.0 .
 # Name the base image by its digest where builds must repeat: --build-arg BASE=python:3.11-slim-bookworm@sha256:...
+# A base without one is told; with --build-arg PINNED=1 it is refused.
 ARG BASE=python:3.11-slim-bookworm
 FROM ${BASE} AS build
+ARG BASE
+ARG PINNED=
+RUN case "${BASE}" in *@sha256:*) ;; *) echo "${BASE} names no digest: another day it may be another image" >&2; test -z "${PINNED}" ;; esac
 # Where pip looks, if not in its default place.
 ARG PIP_INDEX_URL=
 ARG PIP_EXTRA_INDEX_URL=
@@ -20,6 +24,8 @@ RUN /opt/build/bin/python -m hatchling build -t wheel -d /dist && /opt/potserver
 RUN /opt/build/bin/cyclonedx-py environment /opt/potserver --pyproject pyproject.toml -o /opt/potserver/sbom.cdx.json
 
 FROM ${BASE}
+ARG BASE
+LABEL org.opencontainers.image.base.name="${BASE}"
 RUN useradd --system --uid 10001 --create-home --home-dir /var/lib/potserver potserver
 RUN install -d -m 0700 -o potserver -g potserver /var/lib/potserver /var/cache/potserver
 COPY --from=build /opt/potserver /opt/potserver

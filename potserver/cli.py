@@ -10,6 +10,7 @@ from potclient.commands.completion import add_completion_flag
 from potclient.commands.parsers import CommandParser
 from potclient.errors import PotclientError
 from potschemas import __version__
+from potschemas.redaction import redacted
 from potserver.commands import acl, atoms, config, demo, maps, ros, serve
 from potserver.commands import eval as evaluation
 from potserver.commands.shared import EXIT_OK, EXIT_USAGE, Formatter, say
@@ -35,7 +36,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             return EXIT_USAGE
         return int(options.run(options))
     except (PotserverError, PotclientError) as error:
-        say(f"potserver: {error}", sys.stderr)
+        say(f"potserver: {redacted(str(error))}", sys.stderr)
         return EXIT_USAGE
     except BrokenPipeError:  # `potserver config show | head`
         sys.stderr.close()

@@ -56,16 +56,24 @@ def configure_logging(level: str = "info", style: str = "auto", stream: TextIO |
     """
     stream = stream or sys.stderr
     for_people = style == "console" or (style == "auto" and stream.isatty())
-    renderers: list[Any] = (
-        [structlog.dev.ConsoleRenderer(colors=stream.isatty())]
+    renderer: Any = (
+        # as plain text: pretty tracebacks show the values of variables
+        structlog.dev.ConsoleRenderer(
+            colors=stream.isatty(), exception_formatter=structlog.dev.plain_traceback
+        )
         if for_people
-        else [structlog.processors.format_exc_info, structlog.processors.JSONRenderer()]
+        else structlog.processors.JSONRenderer()
     )
     handler = logging.StreamHandler(stream)
     handler.setFormatter(
         structlog.stdlib.ProcessorFormatter(
             foreign_pre_chain=_SHARED,
-            processors=[structlog.stdlib.ProcessorFormatter.remove_processors_meta, *renderers],
+            processors=[
+                structlog.stdlib.ProcessorFormatter.remove_processors_meta,
+                structlog.processors.format_exc_info,
+                _hide_secrets,  # in the tracebacks too
+                renderer,
+            ],
         )
     )
     root = logging.getLogger()

@@ -6,7 +6,6 @@ import atexit
 import dataclasses
 import logging
 import threading
-import weakref
 from collections.abc import Callable, Iterator, Sequence
 from types import TracebackType
 
@@ -39,7 +38,8 @@ log = logging.getLogger("potclient")
 
 _CLOSE_S = 15.0
 
-_open_clients: weakref.WeakSet[MapClient] = weakref.WeakSet()
+# Who forgets one leaves its threads inside Zenoh: it is closed at the end, and not collected before.
+_open_clients: set[MapClient] = set()
 
 
 @atexit.register

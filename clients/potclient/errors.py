@@ -4,13 +4,17 @@ from __future__ import annotations
 
 from potschemas import messages
 from potschemas.messages import ABSENT, ErrorCode, ErrorReply
+from potschemas.redaction import redacted
 
 
 class PotclientError(Exception):
-    """Base of all expected errors; `retryable` says whether the same call may succeed later."""
+    """Base of all expected errors; `retryable` says whether the same call may succeed later. Texts hold no secrets."""
 
     retryable: bool = False
     retry_after_s: float | None = None
+
+    def __str__(self) -> str:
+        return str(redacted(super().__str__()))
 
 
 # --- the client's own --------------------------------------------------------------------------------------------------------

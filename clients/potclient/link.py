@@ -34,6 +34,7 @@ from potclient.zenoh_config import DEFAULT_ENDPOINT
 from potschemas import messages
 from potschemas.keys import MapKeys, server_of
 from potschemas.messages import Message
+from potschemas.redaction import redacted
 from potschemas.wire import WireError, decode, encode, encoding_of
 
 log = logging.getLogger("potclient")
@@ -112,7 +113,7 @@ class Link:
         self, keys: MapKeys, options: SessionOptions, timeout_s: float, session: zenoh.Session | None = None
     ) -> None:
         self.keys, self.timeout_s = keys, timeout_s
-        self.where = ", ".join(options.connect) or DEFAULT_ENDPOINT
+        self.where = redacted(", ".join(options.connect)) or DEFAULT_ENDPOINT
         self.is_closed = False
         self._lock = threading.RLock()
         self._alive: set[tuple[str, str]] = set()  # (server, map) of every liveliness token under the root

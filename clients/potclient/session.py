@@ -12,7 +12,12 @@ import zenoh
 from potclient import diagnosis, zenoh_config
 from potclient.errors import AccessError, NoServerError, UsageError
 from potclient.zenoh_config import DEFAULT_ENDPOINT
-from potschemas.redaction import holds_secret, is_secret
+from potschemas.redaction import holds_secret, is_secret, redacted
+
+_NO_SECRETS = (
+    "a secret in the command line can be read by every user of this machine. Write it into a Zenoh configuration file that only"
+    " you may read (chmod 600), and name that with --config or ZENOH_CONFIG"
+)
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -139,8 +144,11 @@ def options_from_arguments(arguments: argparse.Namespace) -> SessionOptions:
     """The options that `add_zenoh_arguments` parsed.
 
     Raises:
-        UsageError: a `--cfg` is not KEY:VALUE.
+        UsageError: a `--cfg` is not KEY:VALUE, or a flag holds a secret.
     """
+    for endpoint in (*(arguments.connect or ()), *(arguments.listen or ())):
+        if holds_secret(endpoint):
+            raise UsageError(f"{redacted(endpoint)}: {_NO_SECRETS}")
     return SessionOptions(
         connect=tuple(arguments.connect or ()),
         listen=tuple(arguments.listen or ()),
@@ -165,9 +173,6 @@ def parse_overrides(values: Sequence[str]) -> tuple[tuple[str, str], ...]:
         if not colon or not key.strip():
             raise UsageError(f"--cfg {value!r}: need KEY:VALUE, e.g. transport/link/tx/lease:5000")
         if holds_secret(value) or is_secret(key.strip()):
-            raise UsageError(
-                f"--cfg {key}: a secret in the command line can be read by every user of this machine. Write it into a Zenoh"
-                " configuration file that only you may read (chmod 600), and name that with --config or ZENOH_CONFIG"
-            )
+            raise UsageError(f"--cfg {key}: {_NO_SECRETS}")
         pairs.append((key.strip(), json5.strip()))
     return tuple(pairs)

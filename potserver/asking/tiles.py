@@ -22,6 +22,7 @@ from potserver.limits import Limits
 from potserver.numerics.arrays import Int64, UInt8
 
 LEAST_STEP, MOST_STEP = 1e-4, 10.0  # log-odds
+_NO_TILES: Int64 = np.empty((0, 3), np.int64)
 PART_KERNELS = 20_000  # of a part: 200 kB on the wire, at most 800; askers take up to MAX_PART_KERNELS
 _SHORTER = 2  # so many times as many, where two bytes tell a kernel
 
@@ -80,7 +81,8 @@ class Tiles:
         high = None if upper is None else np.floor(upper / size).astype(np.int64)
         present = {} if tiled is None else _present(tiled.tiles, low, high)
         is_whole = self.known is None or self.known.epoch != state.epoch
-        revisions = {} if self.known is None or is_whole else _revisions(self.known, low, high)
+        known = None if is_whole else self.known
+        revisions, gone = ({}, _NO_TILES) if known is None else _compared(list(present), known, low, high)
         changed = tuple((i, tile) for i, tile in present.items() if revisions.get(i) != tile.revision)
         coding = None
         if self.step is not None:
@@ -98,7 +100,7 @@ class Tiles:
             spacings_m=() if tiled is None else tiled.grid.spacings_m,
             is_whole=is_whole,
             tiles=changed,
-            gone=np.array([i for i in revisions if i not in present], np.int64).reshape(-1, 3),
+            gone=gone,
             coding=coding,
             part_size=part_kernels if coding is None else _SHORTER * part_kernels,
         )
@@ -238,11 +240,29 @@ def _present(tiles: Mapping[TileIndex, Tile], low: Int64 | None, high: Int64 | N
     return {index: everywhere[index] for index, is_in in zip(everywhere, inside, strict=True) if is_in}
 
 
-def _revisions(known: KnownTiles, low: Int64 | None, high: Int64 | None) -> dict[TileIndex, int]:
-    """What the asker has in a box."""
+def _compared(
+    present: list[TileIndex], known: KnownTiles, low: Int64 | None, high: Int64 | None
+) -> tuple[dict[TileIndex, int], Int64]:
+    """What an asker has of a box: revisions of the tiles that the map has too, and (G, 3) the others.
+
+    Whatever it says that it has, the interpreter is never held for long: arrays are sorted, and no lists are made of them.
+    """
     meant = _inside(known.indices, low, high)
-    pairs = zip(known.indices[meant].tolist(), known.revisions[meant].tolist(), strict=True)
-    return {(x, y, z): revision for (x, y, z), revision in pairs}
+    ours = np.array(present, np.int64).reshape(-1, 3)
+    both = np.concatenate([ours, known.indices[meant]])
+    order = np.lexsort(
+        both.T
+    )  # stable: of equal ones the map's comes first, and what the asker said last comes last
+    ordered = both[order]
+    is_first = np.ones(len(order), np.bool_)
+    is_first[1:] = (ordered[1:] != ordered[:-1]).any(axis=1)
+    first = order[is_first]
+    last = order[np.append(is_first[1:], np.ones(min(len(order), 1), np.bool_))]
+    is_present, is_known = first < len(ours), last >= len(ours)
+    told = known.revisions[meant][last[is_known] - len(ours)]
+    shared = is_present[is_known]
+    revisions = zip(first[is_known][shared].tolist(), told[shared].tolist(), strict=True)
+    return {present[t]: revision for t, revision in revisions}, both[last[is_known & ~is_present]]
 
 
 def _inside(index: Int64, low: Int64 | None, high: Int64 | None) -> NDArray[np.bool_]:

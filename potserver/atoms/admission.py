@@ -39,6 +39,10 @@ _MIN_AUC = 0.9  # of the atom's own hits over its own free points; the built-in 
 _MAX_OWN_NLL = (
     0.6  # of the answers at the atom's own points, each label alone; the built-in atoms reach .32 and .40
 )
+# Of a kernel's weight, the part that it does not say at the nearest of the atom's own points: nobody has seen that it is so.
+_MAX_UNVOUCHED = 60.0  # log-odds; the built-in atoms reach 20
+_MAX_RMS_UNVOUCHED = 5.0  # over the kernels; the built-in atoms reach 1.9
+_AT_ONCE = 256  # kernels whose distances to all points are computed together
 MIN_DISTANCE_M2 = 0.25  # to every other atom; the built-in atoms keep 2.3
 
 
@@ -59,6 +63,7 @@ class Refusal(str, Enum):
     WILD_KERNELS = "wild_kernels"  # weights, variances or widths out of range
     UNEXPLAINED = "unexplained"  # the kernels do not tell the atom's own hits from its own free points
     UNCALIBRATED = "uncalibrated"  # they rank them, and say of one label that it is the other
+    UNVOUCHED = "unvouched"  # its kernels speak of places where it has no points
     DUPLICATE = "duplicate"
     TOO_FEW_SCANS = "too_few_scans"  # of those that a place is learned from
 
@@ -89,6 +94,7 @@ def admit(
         _check_place(atom)
         _check_kernels(atom)
         _check_own_points(atom)
+        _check_vouched(atom)
         _check_new(atom, dictionary, min_distance_m2, threads)
 
 
@@ -125,6 +131,27 @@ def _check_own_points(atom: Atom) -> None:
                 Refusal.UNCALIBRATED,
                 f"its kernels answer at its own {name} with NLL {nll:.2f}, need {_MAX_OWN_NLL}: learn it again",
             )
+
+
+def _check_vouched(atom: Atom) -> None:
+    """What stands where no point of the atom lies is answered for by nothing, and would be carried into maps all the same."""
+    kernels = atom.kernels
+    points = np.concatenate([atom.hit_points, atom.free_points]).astype(np.float64)
+    square_m2 = np.concatenate(
+        [
+            np.square(kernels.hinge_mean[i : i + _AT_ONCE, None] - points).sum(axis=2).min(axis=1)
+            for i in range(0, len(kernels), _AT_ONCE)
+        ]
+    )
+    said = np.exp(-kernels.gamma.astype(np.float64) * square_m2)
+    unvouched = np.abs(kernels.weight_mean.astype(np.float64)) * (1.0 - said)
+    most, rms = float(unvouched.max()), float(np.sqrt(np.square(unvouched).mean()))
+    if not (most <= _MAX_UNVOUCHED and rms <= _MAX_RMS_UNVOUCHED):
+        raise _refused(
+            Refusal.UNVOUCHED,
+            f"its kernels say up to {most:.3g} log-odds, {rms:.3g} in root mean square, where it has no points; the limits are"
+            f" {_MAX_UNVOUCHED:g} and {_MAX_RMS_UNVOUCHED:g}: leave out kernels that are far from all its points",
+        )
 
 
 def _check_record(atom: Atom, dictionary: AtomDictionary, max_atoms: int) -> None:

@@ -12,6 +12,7 @@ from potserver.errors import MapFullError, OldSequenceError
 Heard = Mapping[str, Mapping[str, int]]  # robot to session to its last number; of sessions the newest is last
 
 MAX_ROBOTS = 2**15  # that a map can tell apart
+MAX_SEQ = 2**63 - 1  # of a message
 _SESSIONS = 8  # remembered of a robot: its programs that run side by side, and some that ran before
 
 
@@ -52,10 +53,13 @@ class CloudOrder:
             )
         wanted = self.next_seq(robot, session)
         if seq < wanted:
+            is_full = wanted > MAX_SEQ
             raise OldSequenceError(
                 f"cloud {seq} of {robot} is not above {wanted - 1}, the last one taken of its session"
-                f" {session or '(none named)'}: {wanted} or more would be taken, or any number in a new session",
-                next_seq=wanted,
+                f" {session or '(none named)'}: "
+                + ("" if is_full else f"{wanted} or more would be taken, or ")
+                + "any number in a new session",
+                next_seq=None if is_full else wanted,
             )
 
     def remember(self, robot: str, session: str, seq: int) -> None:

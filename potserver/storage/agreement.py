@@ -9,6 +9,7 @@ from potserver.errors import MapFileError
 from potserver.storage.journal import Journal
 from potserver.storage.map_file import MapRecord
 from potserver.storage.mark import Progress
+from potserver.storage.sqlite import log_of
 
 JOURNAL, TILES, MARK = "journal.sqlite", "tiles.sqlite", "mark"
 
@@ -29,7 +30,8 @@ def check_complete(folder: Path) -> bool:
     """
     has_begun = (folder / MARK).exists()
     gone = [name for name in (JOURNAL, TILES) if not (folder / name).exists()]
-    if has_begun and gone:
+    # SQLite deletes a log whose file is new
+    if gone and (has_begun or any(log_of(folder / name).exists() for name in gone)):
         raise _disagree(folder, f"{' and '.join(gone)} {'is' if len(gone) == 1 else 'are'} missing")
     return has_begun
 

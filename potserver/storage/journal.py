@@ -10,7 +10,7 @@ from __future__ import annotations
 import contextlib
 import secrets
 import sqlite3
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import msgspec
@@ -107,35 +107,30 @@ class Journal:
         """Scans up to this number may be gone."""
         return self._head.pruned
 
-    def stage(self, cloud: bytes, *, prune_to: int, check: Callable[[], None] = lambda: None) -> None:
+    def stage(self, cloud: bytes, *, prune_to: int) -> None:
         """Write a scan, on the disk when this returns, that does not count before `count_staged`. One that never did goes.
 
         Args:
             cloud: The scan as `pot.cloud.v1`, with pose and robot.
             prune_to: Number of the last scan that is in a snapshot: it and those before it are deleted.
-            check: Called before anything is written; if it raises, nothing is.
         Raises:
             StorageError: the disk refuses.
         """
         number = self._head.last + 1
         content = sealed(cloud, place=_place(number))
         with transaction(self._connection, self._path):
-            check()
             self._connection.execute("INSERT OR REPLACE INTO scans VALUES (?, ?)", (number, content))
             self._prune(prune_to)
             head = self._put_head(pruned=max(prune_to, self.pruned))
         self._head = head
 
-    def count_staged(self, check: Callable[[], None] = lambda: None) -> None:
+    def count_staged(self) -> None:
         """The staged scan is one of the journal from now on, and that is on the disk when this returns.
 
-        Args:
-            check: As for `stage`.
         Raises:
             StorageError: the disk refuses; the journal is as it was.
         """
         with transaction(self._connection, self._path):
-            check()
             head = self._put_head(last=self._head.last + 1)
         self._head = head
 

@@ -328,7 +328,9 @@ def _read(
     threads = default_threads()
     with reading(path), contextlib.ExitStack() as stack:
         connection.execute("BEGIN")
-        stack.callback(connection.execute, "COMMIT")
+        stack.callback(
+            connection.rollback
+        )  # nothing was written; after an error of the disk there is no transaction any more
         found = connection.execute("SELECT record FROM map").fetchall()
         if not found and connection.execute("SELECT 1 FROM tiles LIMIT 1").fetchone() is None:
             return None

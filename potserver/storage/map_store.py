@@ -252,21 +252,23 @@ class MapStore:
             StorageError: the disk refuses; the scan must not enter the map. MapDamagedError: see `check_readable`.
         """
         payload = encode_cloud(scan)
-        staged = self._stager.submit(
-            self._journal.stage, payload, prune_to=self._taken, check=self._check_files
-        )
+        staged = self._stager.submit(self._stage, payload, self._taken)
         try:
             yield lambda: self._keep(len(payload), staged)
         finally:
             concurrent.futures.wait([staged])  # nothing goes on behind the writer's back
+
+    def _stage(self, payload: bytes, prune_to: int) -> None:
+        with self._writing_to(JOURNAL):
+            self._journal.stage(payload, prune_to=prune_to)
 
     def _keep(self, n_bytes: int, staged: concurrent.futures.Future[None]) -> None:
         started_s = time.perf_counter()
         self.check_readable()
         try:
             staged.result()
-            self._journal.count_staged(self._check_files)
-            self._check_files()
+            with self._writing_to(JOURNAL):
+                self._journal.count_staged()
         except StorageError:
             self._health.count("store.appends_failed")
             raise
@@ -398,10 +400,10 @@ class MapStore:
             self._journal.close()
             self._mark.close()
 
-    def _check_files(self) -> None:
+    def _writing_to(self, name: str) -> contextlib.AbstractContextManager[None]:
         """Raises StorageError where what is written now is not what stands on the disk under the store's names."""
-        if self._files is not None:
-            self._files.check()
+        path = self.folder / name
+        return contextlib.nullcontext() if self._files is None else self._files.writing(path, log_of(path))
 
     def _advance_mark(self, **numbers: int) -> None:
         if self._mark is None:
@@ -450,9 +452,8 @@ class MapStore:
             newest.number,
             self._edition + 1,
         )
-        self._check_files()
-        n_bytes = self._tiles.write(newest.state, origin, self.check_readable)
-        self._check_files()
+        with self._writing_to(TILES):
+            n_bytes = self._tiles.write(newest.state, origin, self.check_readable)
         self._edition += 1
         self._advance_mark(edition=self._edition)
         self._taken, self._written = newest.number, (newest.state.epoch, newest.state.map_revision)

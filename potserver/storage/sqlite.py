@@ -9,11 +9,12 @@ from pathlib import Path
 from typing import NamedTuple
 
 from potserver.errors import MapFileError, StorageError
-from potserver.storage.files import claim_file, disk_fault, disk_faults
+from potserver.storage.files import check_no_link, claim_file, disk_fault, disk_faults
 
 _PAGE_BYTES = 16_384  # values are of 10 to 300 kB
 _WAL_BYTES = 64 * 2**20  # to which a long log is cut back
 _BUSY_S = 5.0
+_READ_BYTES = 2**20
 # What SQLite says when the disk refuses, and why; what it says of a damaged file is another matter. (Python 3.10 has no codes.)
 _DISK_FAULTS = {
     "readonly database": "read_only",
@@ -21,6 +22,7 @@ _DISK_FAULTS = {
     "disk I/O error": "io",
     "unable to open": "permission",
     "permission denied": "permission",
+    "locking protocol": "io",  # a file system that cannot lock
 }
 
 
@@ -63,6 +65,7 @@ def connect(
         StorageError: it cannot be opened or written, or somebody else has it open.
     """
     claim_file(path)
+    check_no_link(log_of(path))
     with reading(path):
         connection = sqlite3.connect(
             path, isolation_level=None, check_same_thread=False, timeout=0.0 if exclusive else _BUSY_S
@@ -175,9 +178,23 @@ def reading(path: Path) -> Iterator[None]:
             raise in_use(path) from error
         if (reason := _disk_reason(error)) is not None:
             raise disk_fault("open", path, error, reason) from error
+        _check_readable(path)
         raise MapFileError(
             f"{path} is damaged, or no file of ours: {error}{after_damage(path)}", reason="damaged"
         ) from error
+
+
+def _check_readable(path: Path) -> None:
+    """SQLite calls a file damaged whose bytes the disk does not give: see whether it gives them.
+
+    Raises:
+        StorageError: it does not.
+    """
+    with disk_faults("read", path), contextlib.suppress(FileNotFoundError):
+        for file in (path, log_of(path)):
+            with file.open("rb") as stream:
+                while stream.read(_READ_BYTES):
+                    pass
 
 
 def after_damage(path: Path) -> str:
@@ -185,8 +202,8 @@ def after_damage(path: Path) -> str:
     if path.suffix != ".sqlite":  # a file of its own: a saved map, or something else altogether
         return ". Take another copy of it"
     return (
-        ". Move it and its folder away, start with an empty map, and load a saved copy (`potclient map load NAME`) if there"
-        " is one"
+        f". If `potserver map check {path.parent}` finds nothing, the disk failed for a moment: start again. Else move it and"
+        " its folder away, start with an empty map, and load a saved copy (`potclient map load NAME`) if there is one"
     )
 
 

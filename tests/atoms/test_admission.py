@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -210,6 +211,33 @@ def test_poison_that_keeps_the_ranking_is_refused(builtin: AtomDictionary, log_o
         poison = _biased(atom, log_odds)
         assert own_fit(poison).auc > 0.9
         assert _refusal(poison).reason == Refusal.UNCALIBRATED
+
+
+@pytest.mark.parametrize(("n", "log_odds"), [(600, -24.0), (1, -140.0)], ids=["many", "one"])
+def test_kernels_where_an_atom_has_no_points_are_refused(
+    builtin: AtomDictionary, n: int, log_odds: float
+) -> None:
+    """Its own points cannot tell them from sound ones, and carried to another place they wipe out what stands there."""
+    rng = np.random.default_rng(0)
+    for atom in builtin.of_dims(3).atoms[::4]:
+        points = np.concatenate([atom.hit_points, atom.free_points])
+        azimuth, reach = rng.uniform(-0.5, 0.5, 20_000) * atom.azimuth_width_rad, np.sqrt(rng.random(20_000))
+        flat = atom.radius_m * reach[:, None] * np.stack([np.cos(azimuth), np.sin(azimuth)], axis=1)
+        places = np.append(flat, rng.uniform(-1.0, 3.0, (20_000, 1)), axis=1)
+        far = [p for p in places if np.square(points - p).sum(axis=1).min() > 1.2**2][:n]
+        assert len(far) == n
+        full = functools.partial(np.full, n, dtype=np.float32)
+        added = KernelSet(
+            hinge_mean=np.array(far),
+            hinge_var=np.full((n, 3), 1e-4, np.float32),
+            gamma_shape=full(100.0),
+            gamma_rate=full(100.0 * 2.0 * 0.35**2),
+            weight_mean=full(log_odds),
+            weight_var=full(0.01),
+        )
+        poison = dataclasses.replace(atom, kernels=KernelSet.concatenate([atom.kernels, added]))
+        assert own_fit(poison).nll_hits < 0.4
+        assert _refusal(poison).reason == Refusal.UNVOUCHED
 
 
 def test_built_in_atoms_answer_well_at_their_own_points(builtin: AtomDictionary) -> None:

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import argparse
 import json
+import traceback
 from pathlib import Path
 from typing import Any
 
 import pytest
 import zenoh
 
-from potclient.errors import UsageError
+from potclient import MapClient
+from potclient.cli import main
+from potclient.errors import NoServerError, UsageError
 from potclient.session import SessionOptions, add_zenoh_arguments, build_config, options_from_arguments
 from potclient.zenoh_config import DEFAULT_ENDPOINT
 
@@ -86,6 +89,23 @@ def build_config_with_environment(monkeypatch: pytest.MonkeyPatch, file: Path) -
 def test_endpoints_that_are_none_are_refused(endpoint: str) -> None:
     with pytest.raises(UsageError, match="PROTOCOL/ADDRESS"):
         build_config(SessionOptions(connect=(endpoint,)))
+
+
+@pytest.mark.parametrize("flag", ["-e", "-l"])
+def test_a_secret_in_an_endpoint_of_the_command_line_is_refused(
+    capsys: pytest.CaptureFixture[str], flag: str
+) -> None:
+    assert main(["info", flag, "tls/h:1#connect_private_key_base64=hush"]) == 2
+    told = capsys.readouterr().err
+    assert "--config" in told
+    assert "hush" not in told
+
+
+def test_no_secret_of_an_endpoint_is_in_an_error() -> None:
+    endpoint = "tcp/127.0.0.1:1#password=hush"
+    with pytest.raises(NoServerError, match=r"nobody listens at tcp/127\.0\.0\.1:1#password=") as refused:
+        MapClient(endpoint)
+    assert "hush" not in "".join(traceback.format_exception_only(refused.value))
 
 
 def test_a_secret_in_the_command_line_is_refused_with_the_way_to_do_it() -> None:

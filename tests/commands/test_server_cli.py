@@ -341,6 +341,30 @@ def test_secrets_in_the_command_line_are_refused_with_the_way_to_do_it(
     assert "hush" not in told.err + told.out
 
 
+@pytest.mark.parametrize("style", ["json", "console"])
+def test_no_secret_is_in_a_traceback_that_is_logged(style: str) -> None:
+    """Neither in the error's text, nor as the value of a variable on the way."""
+    stream = io.StringIO()
+    configure_logging("debug", style, stream)
+    password = "".join(("hu", "sh"))
+    try:
+        raise ValueError(f"Zenoh refuses {{usrpwd: {{password: {password!r}}}")
+    except ValueError:
+        get_logger("potserver.test").exception("session_failed")
+    assert "Zenoh refuses" in stream.getvalue()
+    assert "hush" not in stream.getvalue()
+
+
+def test_no_secret_is_in_an_error_about_it(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("POTSERVER_ZENOH__CFG", '{"transport/auth/usrpwd/password": "hush"}')  # no TOML
+    assert cli.main(["config", "show"]) == 2
+    told = capsys.readouterr().err
+    assert "zenoh.cfg" in told
+    assert "hush" not in told
+
+
 def test_secrets_of_variables_are_taken_and_not_shown(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

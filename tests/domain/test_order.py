@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from potserver.domain.order import CloudOrder, joined
+from potserver.domain.order import MAX_SEQ, CloudOrder, joined
 from potserver.errors import MapFullError, OldSequenceError
 
 
@@ -37,6 +37,15 @@ def test_sessions_of_a_robot_do_not_shut_each_other_out() -> None:
         order.check("a", "s", 6)
     with pytest.raises(OldSequenceError):
         order.check("a", "forged", 2**62)
+
+
+def test_a_session_whose_numbers_have_run_out_is_told_no_number_that_no_message_can_hold() -> None:
+    order = heard(("a", "s", MAX_SEQ))
+    for seq in (0, MAX_SEQ):
+        with pytest.raises(OldSequenceError, match=r"session s: any number in a new session") as old:
+            order.check("a", "s", seq)
+        assert old.value.next_seq is None
+    order.check("a", "t", 0)
 
 
 def test_no_robot_is_forgotten_for_another_and_a_cloud_never_comes_in_twice() -> None:

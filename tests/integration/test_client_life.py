@@ -239,6 +239,23 @@ client.info()
     assert done.returncode == status, done.stderr
 
 
+def test_a_client_that_nobody_holds_any_more_is_closed_at_the_end(map_server: MapServer) -> None:
+    """Its threads went on inside Zenoh while the interpreter ended: one process in three was aborted."""
+    program = f"""
+import atexit, gc, threading
+atexit.register(lambda: print([t.name for t in threading.enumerate() if t.name.startswith("potclient-")]))
+from potclient import MapClient
+client = MapClient({map_server.endpoint!r})
+client.info()
+del client
+gc.collect()
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", program], timeout=2 * DEADLINE_S, capture_output=True, text=True, check=False
+    )
+    assert (done.returncode, done.stdout) == (0, "[]\n"), done.stderr
+
+
 class InUse:
     """A declaration that another thread is using: the library refuses to undeclare it."""
 
@@ -266,3 +283,27 @@ def test_a_close_goes_on_where_another_thread_is_asking() -> None:
         assert not [thread for thread in before if thread.is_alive()]
         with pytest.raises(PotclientError):
             asked()
+
+
+def test_a_close_waits_for_whoever_is_inside_zenoh(map_server: MapServer) -> None:
+    entered, waited_for = threading.Event(), threading.Event()
+
+    class Told(threading.Condition):
+        def wait_for(self, predicate: Any, timeout: float | None = None) -> bool:
+            waited_for.set()
+            return super().wait_for(predicate, timeout)
+
+    def inside() -> None:
+        entered.set()
+        assert waited_for.wait(DEADLINE_S)
+
+    with MapClient(map_server.endpoint) as client:
+        link = client._link
+        link._calls_changed = Told()
+        called = in_background(lambda: link._call(inside))
+        assert entered.wait(DEADLINE_S)
+        client.close()
+        n_inside = link.n_calls
+        waited_for.set()
+        called()
+        assert n_inside == 0

@@ -110,6 +110,22 @@ def test_the_digest_of_the_base_is_written_into_both_files(root: Path, tmp_path:
     assert run.returncode == (0 if digest.startswith("sha256:") else 1), run.stderr
 
 
+@pytest.mark.parametrize("base", ["python:3.11-slim-bookworm", f"python@sha256:{'0a' * 32}"])
+@pytest.mark.parametrize("pinned", ["", "1"])
+def test_a_base_without_a_digest_is_told_or_refused(dockerfile: Path, base: str, pinned: str) -> None:
+    stage = instructions(dockerfile)
+    (check,) = (rest for word, rest in stage if word == "RUN" and "names no digest" in rest)
+    run = subprocess.run(
+        ["sh", "-ec", check], env={"BASE": base, "PINNED": pinned}, capture_output=True, text=True
+    )
+    has_digest = "@" in base
+    assert bool(run.stderr) != has_digest
+    assert (run.returncode == 0) == (has_digest or not pinned)
+    assert check == next(rest for word, rest in stage if word == "RUN"), "before anything is fetched"
+    label = 'org.opencontainers.image.base.name="${BASE}"'
+    assert ("LABEL", label) in last_stage(dockerfile)
+
+
 def test_packages_are_pinned_by_hash(dockerfile: Path) -> None:
     installs = [
         command

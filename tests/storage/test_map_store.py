@@ -495,7 +495,7 @@ def test_a_file_that_was_cut_off_is_refused_with_what_to_do(
     content = (crashed[0] / ("saved/default" if is_map else "default") / file).read_bytes()
     (tmp_path / file).write_bytes(content[: len(content) // 2])
     read: Callable[[Path], Any] = _scans_of if file == JOURNAL else read_map
-    with pytest.raises(MapFileError, match="Take another copy" if is_map else "Move it and its folder away"):
+    with pytest.raises(MapFileError, match="Take another copy" if is_map else "move it and its folder away"):
         read(tmp_path / file)
 
 

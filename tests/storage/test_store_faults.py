@@ -10,11 +10,13 @@ import sqlite3
 import stat
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from potserver.domain.map_state import MapState
 from potserver.errors import MapFileError, StorageError
+from potserver.storage import map_file
 from potserver.storage.agreement import JOURNAL, MARK, TILES
 from potserver.storage.journal import scans_after
 from potserver.storage.mark import read_mark
@@ -135,6 +137,25 @@ def test_a_journal_without_the_one_that_was_there_is_no_new_map(tmp_path: Path, 
         open_map(left)
 
 
+@pytest.mark.parametrize("was_killed", [True, False])
+def test_a_log_whose_file_is_gone_is_no_new_store(
+    killed: tuple[Path, MapState], tmp_path: Path, open_map: OpenMap, was_killed: bool
+) -> None:
+    folder = copied(killed, tmp_path / "left")
+    for name in FILES:
+        (folder / name).unlink()
+    if not was_killed:  # nothing is left: a new store
+        for name in (JOURNAL, TILES):
+            log_of(folder / name).unlink()
+        assert open_map(folder.parent).restored.n_scans == 0
+        return
+    logs = {path.name: path.read_bytes() for path in folder.iterdir()}
+    for _ in range(2):
+        with pytest.raises(MapFileError, match=r"journal.sqlite and tiles.sqlite are missing"):
+            open_map(folder.parent)
+        assert {path.name: path.read_bytes() for path in folder.iterdir()} == logs
+
+
 def test_without_waiting_for_the_disk_a_power_cut_costs_the_end_and_numbers_go_on(
     tmp_path: Path, open_map: OpenMap
 ) -> None:
@@ -194,6 +215,26 @@ def test_nothing_is_acknowledged_into_files_that_are_gone(
     aside.rename(path)
     ours.take(make_scan(2))
     assert_same_map(ours.state, open_map(ours.crash(tmp_path / "copy")).state)
+
+
+@pytest.mark.parametrize("file", [JOURNAL, TILES, f"{JOURNAL}-wal", f"{TILES}-wal"])
+def test_nothing_is_acknowledged_into_files_that_somebody_cut(
+    tmp_path: Path, open_map: OpenMap, file: str
+) -> None:
+    """By hand, or by a backup that is put back over the files of a running server: the names mean the same files still."""
+    ours = open_map(tmp_path / "store")
+    ours.take(make_scan(1))
+    ours.store.save(None, ours.mapper, ours.heard)
+    path, before = tmp_path / "store" / "default" / file, ours.state
+    os.truncate(path, path.stat().st_size - 1)
+    write = (
+        (lambda: ours.take(make_scan(2)))
+        if JOURNAL in file
+        else (lambda: ours.store.save(None, ours.mapper, ours.heard))
+    )
+    with pytest.raises(StorageError, match="somebody else cut it") as refused:
+        write()
+    assert (refused.value.reason, ours.state) == ("gone", before)
 
 
 def test_what_is_removed_at_the_end_is_said(tmp_path: Path, open_map: OpenMap) -> None:
@@ -258,6 +299,19 @@ def test_a_link_in_the_place_of_a_file_is_refused(tmp_path: Path, open_map: Open
     assert elsewhere.read_bytes() == before
 
 
+@pytest.mark.parametrize("file", [JOURNAL, TILES])
+def test_a_link_in_the_place_of_a_log_is_refused(
+    killed: tuple[Path, MapState], tmp_path: Path, open_map: OpenMap, file: str
+) -> None:
+    path, elsewhere = log_of(copied(killed, tmp_path / "left") / file), tmp_path / "elsewhere"
+    path.rename(elsewhere)
+    path.symlink_to(elsewhere)
+    before = elsewhere.read_bytes()
+    with pytest.raises(MapFileError, match="is a symbolic link"):
+        open_map(tmp_path / "left")
+    assert elsewhere.read_bytes() == before
+
+
 # --- whose fault it is ------------------------------------------------------------------------------------------------
 
 
@@ -268,6 +322,7 @@ def test_a_link_in_the_place_of_a_file_is_refused(tmp_path: Path, open_map: Open
         ("database or disk is full", "full"),
         ("disk I/O error", "io"),
         ("unable to open database file", "permission"),
+        ("locking protocol", "io"),
     ],
 )
 @pytest.mark.parametrize("wrap", [reading, lambda path: transaction(sqlite3.connect(":memory:"), path)])
@@ -277,6 +332,47 @@ def test_what_the_disk_refuses_is_not_called_damaged(
     with pytest.raises(StorageError, match="nothing is wrong with the map") as caught, wrap(tmp_path / "f"):  # type: ignore[attr-defined]
         raise sqlite3.OperationalError(says)
     assert caught.value.reason == reason
+
+
+@pytest.mark.parametrize("says", ["database disk image is malformed", "file is not a database"])
+def test_a_file_that_the_disk_cannot_read_is_not_called_damaged(tmp_path: Path, says: str) -> None:
+    """SQLite does: to it a page that cannot be read is one that holds nonsense."""
+    file, mended = tmp_path / "f", tmp_path / "mended"
+    file.symlink_to("/proc/self/mem")  # whose first bytes are an I/O error
+    mended.write_bytes(b"nonsense")
+    with (
+        pytest.raises(StorageError, match=r"cannot read .* nothing is wrong with the map") as caught,
+        reading(file),
+    ):
+        raise sqlite3.DatabaseError(says)
+    assert caught.value.reason == "io"
+    log_of(mended).symlink_to("/proc/self/mem")
+    with pytest.raises(StorageError, match="cannot read"), reading(mended):
+        raise sqlite3.DatabaseError(says)
+    log_of(mended).unlink()
+    with pytest.raises(MapFileError, match="is damaged"), reading(mended):
+        raise sqlite3.DatabaseError(says)
+
+
+class FailingOnce(sqlite3.Connection):
+    """A disk that fails while the tiles are read: SQLite rolls back by itself then."""
+
+    def execute(self, sql: str, *values: Any) -> sqlite3.Cursor:
+        if sql.startswith("SELECT x, y, z, data"):
+            self.rollback()
+            raise sqlite3.OperationalError("disk I/O error")
+        return super().execute(sql, *values)
+
+
+def test_a_disk_that_fails_while_a_map_is_read_is_said_and_not_its_consequence(
+    killed: tuple[Path, MapState], tmp_path: Path
+) -> None:
+    file = copied(killed, tmp_path / "left") / TILES
+    with (
+        contextlib.closing(sqlite3.connect(file, factory=FailingOnce, isolation_level=None)) as connection,
+        pytest.raises(StorageError, match="disk I/O error"),
+    ):
+        map_file._read(connection, file, {}, None)
 
 
 def test_the_mark_names_what_was_acknowledged(tmp_path: Path, open_map: OpenMap) -> None:
