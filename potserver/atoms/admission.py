@@ -147,7 +147,7 @@ def _check_vouched(atom: Atom) -> None:
     unvouched = np.abs(kernels.weight_mean.astype(np.float64)) * (1.0 - said)
     most, rms = float(unvouched.max()), float(np.sqrt(np.square(unvouched).mean()))
     if not (most <= _MAX_UNVOUCHED and rms <= _MAX_RMS_UNVOUCHED):
-        raise _refused(
+        raise refused(
             Refusal.UNVOUCHED,
             f"its kernels say up to {most:.3g} log-odds, {rms:.3g} in root mean square, where it has no points; the limits are"
             f" {_MAX_UNVOUCHED:g} and {_MAX_RMS_UNVOUCHED:g}: leave out kernels that are far from all its points",
