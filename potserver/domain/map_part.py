@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from functools import cache
 
 import numpy as np
@@ -74,6 +74,12 @@ class MapPart:
             lookup=lookup,
             n_kernels=sum(counts),
             box=_box(hinge + of_tile * part.tile_m),
+        )
+
+    def is_of(self, sets: Collection[KernelSet]) -> bool:
+        """Whether it was made of just these sets of kernels, in this order."""
+        return len(sets) == len(self.members) and all(
+            a is b for a, (b, _) in zip(sets, self.members, strict=True)
         )
 
     @property

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -118,6 +118,7 @@ class Tile(NamedTuple):
     revision: int = 0  # of the map, when the tile was made
     stamp_ns: int = 0  # map time at which the rows weigh what they say
     lean: UInt8 | None = None  # (X, Y, Z) nodes of `potschemas.lean`; the kernels say what the rows add to it
+    news: Float32 | None = None  # (2, B, B, B) see `Region.news`; None: none, as when a map was just read
 
     @property
     def is_empty(self) -> bool:
@@ -127,8 +128,8 @@ class Tile(NamedTuple):
     @property
     def n_bytes(self) -> int:
         """About what it takes in memory, with its share of the index."""
-        lean = 0 if self.lean is None else self.lean.nbytes
-        return _ROW_BYTES * len(self.rows.kind) + _KERNEL_BYTES * len(self.kernels) + lean
+        beside = sum(array.nbytes for array in (self.lean, self.news) if array is not None)
+        return _ROW_BYTES * len(self.rows.kind) + _KERNEL_BYTES * len(self.kernels) + beside
 
 
 class TileGrid(NamedTuple):
@@ -166,6 +167,16 @@ class TileGrid(NamedTuple):
     def voxels(self) -> int:
         """Voxels of free space along a tile's edge; of hits there are twice as many."""
         return round(self.size_m / self.fine_m)
+
+    @property
+    def blocks(self) -> int:
+        """Blocks along a tile's edge, of two coarse cells each."""
+        return self.voxels // _VOXELS_OF_PAIR
+
+    @property
+    def block_m(self) -> float:
+        """Edge of a block: about as far as a coarse kernel reaches."""
+        return self.size_m / self.blocks
 
     @property
     def lean_nodes(self) -> tuple[int, int, int]:
@@ -223,7 +234,7 @@ class TiledMap(NamedTuple):
         return self._replace(robots=(*self.robots[:number], FREE, *self.robots[number + 1 :]))
 
     def with_tiles(self, changed: Mapping[TileIndex, Tile], *, threads: int = 1) -> TiledMap:
-        """The map with some tiles exchanged, or gone if they are empty; only the parts that they lie in are made anew."""
+        """The map with some tiles exchanged, or gone if they are empty; parts without other kernels than before stay."""
         tiles = dict(self.tiles)
         for index, tile in changed.items():
             if tile.is_empty:
@@ -233,6 +244,9 @@ class TiledMap(NamedTuple):
 
         def ready(number: TileIndex) -> MapPart | None:
             found = {index: tiles[index].kernels.kernels for index in tiles_of_part(number) if index in tiles}
+            former = self.parts.get(number)
+            if former is not None and former.is_of(found.values()):
+                return former
             return MapPart.of_tiles(found, Part(self.grid.size_m, _PART, number)) if found else None
 
         touched = list(dict.fromkeys(part_of(index) for index in changed))
@@ -292,7 +306,15 @@ class Region:
     rows: Rows
     kernels: MapKernels
     lean: dict[TileIndex, UInt8]  # of those tiles that have one
+    former: dict[TileIndex, Tile]  # as they were copied
+    # (2, X, Y, Z) of each block, what came since it was solved: the growth of its rows, sum of |change of log(1 + looks)|, and
+    # the looks of hits that are new or gone
+    news: Float32
     cells: Cells | None = None  # of the rows, once known
+    gained: Float32 = dataclasses.field(
+        default_factory=lambda: np.zeros(0, np.float32)
+    )  # (R,) looks, by the last samples
+    still: Bool | None = None  # (X, Y, Z) tiles whose kernels are as they were
 
     @staticmethod
     def of(
@@ -327,6 +349,7 @@ class Region:
             grid=grid, lower=low, upper=high, kernels=kernels.moved(np.asarray(of_kernel * grid.size_m, np.float64)),
             rows=rows._replace(voxel=(rows.voxel + of_row * edge).astype(np.int32)),
             lean={index: tile.lean for index, tile in zip(found, members, strict=True) if tile.lean is not None},
+            former=dict(zip(found, members, strict=True)), news=_news_of(members, shift, np.subtract(high, low) + 1, grid),
         )  # fmt: skip
 
     @property
@@ -358,16 +381,22 @@ class Region:
         kernel_of, kernel_cuts = by_number(
             np.ravel_multi_index(tuple(kernel_tile.T), tuple(size)), int(size.prod())
         )
+        n_blocks = self.grid.blocks
         out = {}
         for number, shift in enumerate(itertools.product(*(range(s) for s in size))):
             index = (self.lower[0] + shift[0], self.lower[1] + shift[1], self.lower[2] + shift[2])
             if all(x <= i <= y for x, i, y in zip(low, index, high, strict=True)):
+                is_still = self.still is not None and self.still[shift] and index in self.former
+                news = self.news[_blocks_of(shift, n_blocks)]
                 out[index] = Tile(
                     rows.take(np.arange(*row_cuts[number : number + 2])),
-                    kernels.take(kernel_of[slice(*kernel_cuts[number : number + 2])]),
+                    self.former[index].kernels
+                    if is_still
+                    else kernels.take(kernel_of[slice(*kernel_cuts[number : number + 2])]),
                     revision,
                     stamp_ns,
                     self.lean.get(index),
+                    news.copy() if news.any() else None,
                 )
         return out
 
@@ -384,20 +413,6 @@ class Region:
         order, cuts = by_number(tile, int(size.prod()))
         return rows._replace(voxel=voxel).take(order), cuts
 
-    def unseen_tiles(self, lower_m: Float64, upper_m: Float64) -> list[TileIndex]:
-        """The tiles that a box touches, (3,) m, map frame, and that no evidence is in."""
-        low, high = self.grid.index_of(lower_m), self.grid.index_of(upper_m)
-        size = self.size
-        is_seen = np.zeros(int(size.prod()), bool)
-        is_seen[tile_of(self.rows, self.grid.voxels, size)[0]] = True
-        seen = is_seen.reshape(tuple(size))
-        axes = [
-            range(max(a, x), min(b, y) + 1)
-            for a, b, x, y in zip(low, high, self.lower, self.upper, strict=True)
-        ]
-        x0, y0, z0 = self.lower
-        return [(x, y, z) for x, y, z in itertools.product(*axes) if not seen[x - x0, y - y0, z - z0]]
-
     def lean_at(self, points: Float64, threads: int) -> Float32 | None:
         """(N,) log-odds at (N, 3) points of the region, 0 where its tiles do not lean; None if none does."""
         if not self.lean:
@@ -410,3 +425,19 @@ class Region:
 def voxels_along(rows: Rows, grid: TileGrid) -> NDArray[np.int64]:
     """(R, 1) voxels along a tile's edge, for each row in the voxels of its kind."""
     return np.asarray(grid.voxels << rows.halvings.astype(np.int64), np.int64)[:, None]
+
+
+def _blocks_of(tile: Sequence[int], n: int) -> tuple[slice, ...]:
+    """Where the blocks of a region's tile are in `Region.news`; the tile counted from the region's corner, `n` to an edge."""
+    x, y, z = tile
+    return slice(None), slice(x * n, (x + 1) * n), slice(y * n, (y + 1) * n), slice(z * n, (z + 1) * n)
+
+
+def _news_of(tiles: list[Tile], at: NDArray[np.int64], size: NDArray[np.int64], grid: TileGrid) -> Float32:
+    """See `Region.news`; the tiles lie at (T, 3) places of a region of (3,) tiles."""
+    n = grid.blocks
+    news = np.zeros((2, *(size * n)), np.float32)
+    for tile, place in zip(tiles, at.tolist(), strict=True):
+        if tile.news is not None:
+            news[_blocks_of(place, n)] = tile.news
+    return news

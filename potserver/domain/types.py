@@ -361,7 +361,7 @@ class MapUpdate:
     timings_ms: dict[str, float]  # per stage of the pipeline
     leans_on: str | None = None  # what in the dictionary is expected about this scan
     not_leaning: str | None = (
-        None  # why the map leans on nothing about this scan; none: it does, or never would
+        None  # why the map leans on nothing about this scan; none: it does, nobody asked, or never would
     )
 
     @property

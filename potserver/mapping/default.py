@@ -13,7 +13,7 @@ from potserver.domain.types import KernelSet, OwnMap, ParamsKind, Scan
 from potserver.mapping.carrying import Carrier
 from potserver.mapping.fitting import fitted_map
 from potserver.mapping.fusion import Fused, Look, Moment, fuse, refit, stalest_part
-from potserver.mapping.leaning import Expected
+from potserver.mapping.leaning import Expectation, Expected, lean_of_tiles, tiles_to_lean
 from potserver.mapping.pipeline import Integrated, LabelledScan, Pipeline, ScanMap, integrated
 from potserver.mapping.refinement import borrowed_prior, instantaneous_map
 from potserver.mapping.sampling import Draws
@@ -33,7 +33,10 @@ class DefaultPipeline(Pipeline):
             seen = self.label(scan, draws)
         tiled, source = self.ground(state, seen).with_robot(scan.robot_id)
         with clock("expect"):
-            expected = self.expect(seen, carrier)
+            unseen = tiles_to_lean(tiled, seen.labelled, tiled.grid.coarse_m)
+            is_asked = len(unseen) > 0 or params is ParamsKind.FITTED
+            expected = self.expect(seen, carrier) if is_asked else Expectation(None, None)
+            leans = lean_of_tiles(expected.place, unseen, tiled.grid) if expected.place else {}
         look = Look(
             seen.labelled,
             seen.beams.learned,
@@ -41,7 +44,7 @@ class DefaultPipeline(Pipeline):
             source,
             scan.is_planar,
             draws.surface,
-            expected.place,
+            leans,
         )
         own, fused = parallel_pair(
             lambda: self.own_map(params, seen, expected.place, carrier, tiled.grid.fine_m, clock),

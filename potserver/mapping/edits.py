@@ -32,7 +32,9 @@ from potserver.numerics import evidence
 from potserver.numerics.geometry import rotated_diagonal
 
 _SWEEPS = 3  # over the parts, each solved with those around it held
-_EFFORT = FitEffort(newton_steps=6, most_newton_steps=18)  # nobody waits for an edit as for a scan
+_EFFORT = FitEffort(
+    newton_steps=6, most_newton_steps=18, enough=1e-5
+)  # nobody waits for an edit as for a scan
 
 
 def merge(

@@ -7,11 +7,13 @@ Tiles around a scan age as it comes; of the others one part a scan, the stalest 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
 
 from potschemas.answers import PRIOR_VAR
+from potschemas.lean import Bytes
 from potserver.domain.tiles import (
     CARRIED,
     COARSE,
@@ -26,9 +28,9 @@ from potserver.domain.tiles import (
     scale_of,
     tiles_of_part,
 )
-from potserver.domain.types import Bool, Float64, KernelSet
+from potserver.domain.types import Bool, Float32, Float64, KernelSet
 from potserver.errors import SolverError
-from potserver.mapping.leaning import Expected, lean_of_tiles
+from potserver.mapping.news import due
 from potserver.mapping.placing import activation, gamma_of_spacing, kernels_at
 from potserver.mapping.refinement import FEATURE_CUT
 from potserver.mapping.settings import MappingSettings
@@ -52,15 +54,18 @@ _UNSUPPORTED = 1e-5  # of a kernel's curvature: what no row within its reach lea
 _STALE = 0.125  # half-lives after which a tile that no scan touches is fitted again
 _MEMORY = 200.0  # looks that one place remembers; older ones give way
 _SATURATION = 20.0  # looks at one place that count in a solve; further ones repeat them
+_SETTLED = 1e-5  # relative gain of a step after which nothing is left to gain
 _CHEAP_VALUES = 60_000_000  # features that a solve may touch for more Newton steps than it must take
 
 
 class FitEffort(NamedTuple):
     """Steps of one solve, from where the map is."""
 
-    newton_steps: int = 3  # at least
+    newton_steps: int = 3
     most_newton_steps: int = 6  # where the map is small and steps are cheap
-    gradient_steps: int = 4  # conjugate-gradient steps for each Newton step
+    gradient_steps: int = 8  # conjugate-gradient steps for each Newton step
+    # Relative gain of the objective below which steps end, where they are not cheap: the next scan goes on.
+    enough: float = 0.07
 
 
 SCAN_EFFORT = FitEffort()
@@ -103,7 +108,7 @@ class Look(NamedTuple):
     source: int  # the robot's number in the map
     is_planar: bool  # kernels stay in the plane of the points
     rng: np.random.Generator  # of the samples next to faces
-    expected: Expected | None = None  # what tiles that are seen for the first time lean on
+    leans: Mapping[TileIndex, Bytes]  # of tiles that take one now
 
 
 class Moment(NamedTuple):
@@ -169,14 +174,12 @@ def fuse(
     lower, upper = lower - pad, upper + pad
     region = Region.of(tiled, lower - 4 * pad, upper + 4 * pad, moment.weight_of)
     inside = lower - region.origin_m, upper - region.origin_m  # of tiles that are stored again
-    if look.expected is not None:
-        unseen = region.unseen_tiles(lower, upper)
-        region.lean |= lean_of_tiles(look.expected, unseen, grid)
+    region.lean |= look.leans
     samples = _samples_of(look, region, options, threads)
     new_rows = add_evidence(region, samples, look.source, within=inside, turn=moment.revision)
     none = MapKernels.new(KernelSet.empty(), CARRIED)
     added = add_kernels(region, new_rows, none, options, look.is_planar, threads)
-    fitted = _fit(region, *inside, options, threads)
+    fitted = _fit_news(region, *inside, added, options, moment, threads)
     tiles = region.tiles(lower, upper, revision=moment.revision, stamp_ns=moment.stamp_ns)
     return Fused(tiles, len(added), n_transported=0, converged=fitted)
 
@@ -273,7 +276,7 @@ def add_evidence(
     )
     evidence.clip(rows, _MEMORY)
     evidence.forget(rows, gained, cells, _MEMORY)
-    region.rows, region.cells = rows, cells
+    region.rows, region.cells, region.gained = rows, cells, gained
     new = rows.take(slice(n_old, None))
     return new.take(new.sort <= evidence.HIT)
 
@@ -328,23 +331,67 @@ def _fits_budget(present: Float64, added: Float64, grid: TileGrid, limit: int) -
     return place[len(present) :] < limit
 
 
-def _fit(region: Region, lower: Float64, upper: Float64, options: FusionOptions, threads: int) -> bool:
-    """Solve the weights of the kernels in a box, those around it held; whether the solve went well.
+def _fit_news(
+    region: Region,
+    lower: Float64,
+    upper: Float64,
+    added: MapKernels,
+    options: FusionOptions,
+    moment: Moment,
+    threads: int,
+) -> bool:
+    """Solve the weights where a scan brought news, in a box, those around it held; whether the solve went well.
 
-    Rows and kernels beyond the reach of what is solved for are left out.
+    Where evidence ages, all of it changes with each scan.
     """
-    grid, kernels = region.grid, region.kernels.kernels
-    pad = grid.coarse_m
-    where = evidence.positions(region.rows, grid.fine_m)
+    grid, hinge = region.grid, region.kernels.kernels.hinge_mean
+    where, counts = _counted(region)
+    now = due(region, where, counts, added, _SATURATION, all_of_it=moment.half_life_s > 0.0)
+    free = inside_box(hinge, lower, upper) & now.around(hinge, 0)
+    moved = np.concatenate([hinge[free], added.kernels.hinge_mean])
+    region.still = np.ones(tuple(region.size), bool)
+    region.still[tuple(np.clip(np.floor(moved / grid.size_m).astype(np.int64), 0, region.size - 1).T)] = False
+    if not free.any():
+        return True
+    reach = 2 * grid.coarse_m  # as far as a block
+    seen = inside_box(where, lower - reach, upper + reach) & now.around(where, 1) & (counts > 0.0)
+    near = inside_box(hinge, lower - 2 * reach, upper + 2 * reach) & now.around(hinge, 2)
+    return _solve(region, Part(where, counts, seen, near, free), options, threads)
+
+
+def _fit(region: Region, lower: Float64, upper: Float64, options: FusionOptions, threads: int) -> bool:
+    """Solve the weights of the kernels in a box, those around it held; whether the solve went well."""
+    hinge, reach = region.kernels.kernels.hinge_mean, 2 * region.grid.coarse_m
+    where, counts = _counted(region)
+    seen = inside_box(where, lower - reach, upper + reach) & (counts > 0.0)
+    near = inside_box(hinge, lower - 2 * reach, upper + 2 * reach)
+    return _solve(region, Part(where, counts, seen, near, inside_box(hinge, lower, upper)), options, threads)
+
+
+def _counted(region: Region) -> tuple[Float64, Float32]:
+    """(R, 3) m, where rows stand, and (R,) what they count."""
     counts = evidence.counts(region.rows, region.cells or evidence.cells(region.rows), _SATURATION)
     counts[~evidence.is_alive(region.rows)] = 0.0
-    rows = np.flatnonzero(inside_box(where, lower - 2 * pad, upper + 2 * pad) & (counts > 0.0))
-    counts = counts[rows]
-    local = np.flatnonzero(inside_box(kernels.hinge_mean, lower - 4 * pad, upper + 4 * pad))
-    hinge = kernels.hinge_mean[local]
-    free = inside_box(hinge, lower, upper)
+    return evidence.positions(region.rows, region.grid.fine_m), counts
+
+
+class Part(NamedTuple):
+    """What of a region is solved; rows and kernels beyond the reach of that are left out."""
+
+    where: Float64  # (R, 3) m, of all rows
+    counts: Float32  # (R,) of all rows
+    seen: Bool  # (R,) which rows it is solved on
+    near: Bool  # (K,) which kernels reach them
+    free: Bool  # (K,) which kernels are solved, of those
+
+
+def _solve(region: Region, part: Part, options: FusionOptions, threads: int) -> bool:
+    grid, kernels = region.grid, region.kernels.kernels
+    rows, local = np.flatnonzero(part.seen), np.flatnonzero(part.near)
+    where, counts = part.where[rows], part.counts[rows]
+    hinge, free = kernels.hinge_mean[local], part.free[local]
     blocks = feature_blocks(
-        where[rows],
+        where,
         hinge,
         kernels.gamma[local],
         edge_m=grid.coarse_m,
@@ -356,14 +403,16 @@ def _fit(region: Region, lower: Float64, upper: Float64, options: FusionOptions,
     per_step = blocks.n_values * (2 + 2 * effort.gradient_steps)
     cheap = _CHEAP_VALUES // max(per_step, 1)
     n_newton = int(np.clip(cheap, effort.newton_steps, effort.most_newton_steps))
+    enough = effort.enough if n_newton == effort.newton_steps else _SETTLED
+    solver = Solver(n_newton, effort.gradient_steps, _LONGEST_STEP, enough=enough)
     prior = Prior(
         region.kernels.prior_mean[local],
         region.kernels.prior_var[local],
-        region.lean_at(where[rows], threads),
+        region.lean_at(where, threads),
     )
     fit = warm_fit(
         blocks, evidence.LABELS[region.rows.sort[rows]], counts, prior, kernels.weight_mean[local],
-        Solver(n_newton, effort.gradient_steps, _LONGEST_STEP), free=free, threads=threads,
+        solver, free=free, threads=threads,
     )  # fmt: skip
     if not (np.isfinite(fit.weights).all() and np.isfinite(fit.var).all()):
         raise SolverError(f"the weights of {len(local)} kernels on {len(rows)} rows came out NaN or infinite")

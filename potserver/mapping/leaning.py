@@ -1,7 +1,7 @@
 """What the dictionary expects of a scan's surroundings: the lean of tiles that the map sees for the first time.
 
-A tile takes its lean from the scans that come before its first evidence, and keeps it: its kernels are solved for what evidence
-says beyond the lean, so that another one would need them all solved again.
+A tile takes its lean from the first scan that comes near, and keeps it: its kernels are solved for what evidence says beyond
+the lean, so that another one would need them all solved again.
 """
 
 from __future__ import annotations
@@ -14,9 +14,11 @@ import numpy as np
 
 from potschemas.lean import Bytes, to_bytes
 from potserver.domain.atom_file import Learned
-from potserver.domain.tiles import TileGrid, TileIndex
+from potserver.domain.tiles import TiledMap, TileGrid, TileIndex
 from potserver.domain.types import Bool, Borrowed, Float64
 from potserver.numerics.beams import Beams, LabelledPoints, beam_weights
+from potserver.numerics.flag_grid import FlagGrid, may_be_around
+from potserver.numerics.geometry import bounds
 from potserver.numerics.ground import LEAST_GROUND, LOWEST_EYE_M, Ground, ground_of
 from potserver.numerics.surroundings import Perceptron, Surroundings
 
@@ -150,6 +152,28 @@ def _scale(log_odds: Float64, occupied: Bool, weight: Float64) -> float:
         curvature = (weight * np.square(log_odds) * p * (1.0 - p)).sum() + _SURE_OF_MODEL
         scale = float(np.clip(scale - slope / curvature, 0.0, 2.0))
     return scale
+
+
+def tiles_to_lean(tiled: TiledMap, labelled: LabelledPoints, pad_m: float) -> list[TileIndex]:
+    """The tiles about a scan that take a lean from it: those without, in new columns or in which it is the first to look.
+
+    Args:
+        tiled: The map without the scan.
+        labelled: Of the scan, map frame.
+        pad_m: So far beyond the points tiles count as about the scan.
+    """
+    points, size = labelled.points, tiled.grid.size_m
+    reached = FlagGrid.of(np.floor(points / size).astype(np.int32))
+    box = bounds(points)
+    low, high = tiled.grid.index_of(box[0] - pad_m), tiled.grid.index_of(box[1] + pad_m)
+    columns = itertools.product(*(range(a, b + 1) for a, b in zip(low[:2], high[:2], strict=True)))
+    out = []
+    for x, y in columns:
+        column = [(x, y, z) for z in range(low[2], high[2] + 1)]
+        is_known = any(index in tiled.tiles for index in column)
+        bare = [i for i in column if i not in tiled.tiles]
+        out += [i for i in bare if not is_known or may_be_around(reached, np.asarray(i), 0)]
+    return out
 
 
 def lean_of_tiles(expected: Expected, tiles: list[TileIndex], grid: TileGrid) -> dict[TileIndex, Bytes]:

@@ -24,7 +24,7 @@ from potserver.numerics.feature_blocks import Blocks, gradient_and_diagonal, nor
 
 _SHRINK = 0.25  # by which the line search shortens a step that is too long
 _TRIALS = 12  # of the line search, at most
-_ENOUGH = 1e-5  # relative gain of the objective below which steps end
+_NO_GAIN = 1e-5  # relative gain of the objective that float32 cannot show
 _AT_ONCE = 256  # rows whose losses are summed in float32
 # log(1 + t) / t for t in [0, 1], least squares in Chebyshev's points: off by 2e-8 at most
 _LOG1P = tuple(
@@ -54,6 +54,7 @@ class Solver(NamedTuple):
     # labels part cleanly the weights have far to go and Newton's steps are short; a trial costs no product with Phi.
     longest_step: float = 1.0
     least_curvature: float = 0.01  # of a row that counts once, > 0
+    enough: float = 1e-5  # relative gain of the objective below which steps end
 
 
 class WarmFit(NamedTuple):
@@ -133,12 +134,12 @@ def warm_fit(
             functools.partial(objective, change, step), value, slope, solver.longest_step
         )
         if size == 0.0:
-            converged = -slope <= _ENOUGH * max(1.0, abs(value))  # float32 has nothing left to gain
+            converged = -slope <= _NO_GAIN * max(1.0, abs(value))  # float32 has nothing left to gain
             break
         w = w + np.float32(size) * step
         f = f + np.float32(size) * change
         gain, value = value - trial, trial
-        if gain <= _ENOUGH * max(1.0, abs(value)):
+        if gain <= solver.enough * max(1.0, abs(value)):
             break
     return WarmFit(w, 1.0 / diagonal, diagonal - precision, value, at_start, steps, converged)
 

@@ -103,7 +103,8 @@ def test_two_robots_maps_merge_into_what_one_server_would_hold(planar: bool) -> 
     truth = both.snapshot.occupancy(points)
     for merged in (one, other):
         answer = merged.snapshot.occupancy(points)
-        assert abs(len(merged.snapshot) - len(both.snapshot)) <= 0.02 * len(both.snapshot)
+        # kernels that nothing supports go when their place is solved again
+        assert abs(len(merged.snapshot) - len(both.snapshot)) <= 0.05 * len(both.snapshot)
         # normals come of all hits at hand: near samples of the halves lie a little otherwise
         assert np.abs(answer.mean - truth.mean).mean() < 0.015
         assert _nll(answer, occupied) < _nll(truth, occupied) + 0.005
@@ -152,7 +153,7 @@ def test_a_robot_is_taken_out_again() -> None:
     assert not service.snapshot.occupancy(points + AWAY).observed.any()
     answer, truth = service.snapshot.occupancy(points), alone.snapshot.occupancy(points)
     assert np.abs(answer.mean - truth.mean).mean() < 0.015
-    assert _nll(answer, occupied) == pytest.approx(_nll(truth, occupied), abs=0.01)
+    assert _nll(answer, occupied) == pytest.approx(_nll(truth, occupied), abs=0.015)
     # a kernel that only the other robot asked for stays where our data reach it
     assert len(alone.snapshot) <= len(service.snapshot) < 1.1 * len(alone.snapshot)
     weight = [t.rows.sums[:, 3].astype(float).sum() for t in service.state.tiled.tiles.values()]
