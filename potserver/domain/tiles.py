@@ -118,7 +118,7 @@ class Tile(NamedTuple):
     revision: int = 0  # of the map, when the tile was made
     stamp_ns: int = 0  # map time at which the rows weigh what they say
     lean: UInt8 | None = None  # (X, Y, Z) nodes of `potschemas.lean`; the kernels say what the rows add to it
-    news: Float32 | None = None  # (2, B, B, B) see `Region.news`; None: none, as when a map was just read
+    news: Float32 | None = None  # (2, B, B, B) see `Region.news`; None: none
 
     @property
     def is_empty(self) -> bool:

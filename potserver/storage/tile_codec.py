@@ -1,9 +1,9 @@
 """A tile as bytes on the disk: bit for bit what it was, and compact.
 
 head     what the tile is: its index, revision, stamp, and how many rows and kernels follow
-body     the arrays, column by column, each number's bytes apart (all first bytes, then all second ones), and then the lean's
-         numbers of nodes and its nodes, if the tile has one; deflated: what is alike in a column, such as the widths of a
-         lattice's kernels or their places on it, then takes next to nothing
+body     the arrays, column by column, each number's bytes apart (all first bytes, then all second ones); then, if the tile has a
+         lean or news, the lean's numbers of nodes (0 without one) and its nodes, and the news; deflated: what is alike in a
+         column, such as the widths of a lattice's kernels or their places on it, then takes next to nothing
 seal     of head and body
 """
 
@@ -25,7 +25,7 @@ from potserver.storage.seal import sealed, unsealed
 
 _HEAD = struct.Struct("<3i2q2I")  # index, revision, stamp_ns, rows, kernels
 _LEAN = struct.Struct("<3B")  # nodes along x, y, z
-_MOST_LEAN_BYTES = 2**21 + _LEAN.size  # more than any tile's
+_MOST_LEAN_BYTES = 2**21 + _LEAN.size  # more than any tile's; of nodes
 _LEVEL = 1  # of deflate: the higher ones cost ten times as much for a few per cent
 
 
@@ -50,6 +50,7 @@ _KERNELS = (
     _Column("weight_mean", "<f4", 0),
     _Column("weight_var", "<f4", 0),
 )
+_NEWS = _Column("news", "<f4", 0)
 _MAP_KERNELS = (_Column("level", "|i1", 0), _Column("prior_mean", "<f4", 0), _Column("prior_var", "<f4", 0))
 
 
@@ -63,6 +64,8 @@ def encode_tile(index: TileIndex, tile: Tile) -> bytes:
     ]
     if tile.lean is not None:
         columns.append(_LEAN.pack(*tile.lean.shape) + tile.lean.tobytes())
+    if tile.news is not None:
+        columns += [b"" if tile.lean is not None else _LEAN.pack(0, 0, 0), _planes(tile.news.reshape(-1), _NEWS)]
     head = _HEAD.pack(*index, tile.revision, tile.stamp_ns, len(rows.kind), len(kernels))
     body = zlib.compress(b"".join(columns), _LEVEL)
     return sealed(head + body)
@@ -87,10 +90,12 @@ def decode_tile(data: bytes, grid: TileGrid, n_robots: int) -> tuple[TileIndex, 
     try:
         inflate = zlib.decompressobj()
         # one byte more would show that there is more
-        plain = inflate.decompress(content[_HEAD.size :], n_bytes + _MOST_LEAN_BYTES + 1)
-        lean = _lean_of(plain[n_bytes:])
-        if len(plain) < n_bytes or not inflate.eof or (lean is None and len(plain) != n_bytes):
+        most = n_bytes + _MOST_LEAN_BYTES + _news_bytes(grid)
+        plain = inflate.decompress(content[_HEAD.size :], most + 1)
+        beside = _beside(plain[n_bytes:], grid)
+        if len(plain) < n_bytes or not inflate.eof or beside is None:
             raise MapFileError(f"tile {(x, y, z)} is not of the size that it says", reason="damaged")
+        lean, news = beside
         arrays, start = {}, 0
         for column, n in sizes:
             arrays[column.name], start = _numbers(plain, start, column, n)
@@ -110,6 +115,7 @@ def decode_tile(data: bytes, grid: TileGrid, n_robots: int) -> tuple[TileIndex, 
             resampled(lean, grid.lean_nodes)
             if lean is not None and lean.shape == grid.former_lean_nodes
             else lean,
+            news,
         )
     except (zlib.error, ShapeError) as error:
         raise MapFileError(f"tile {(x, y, z)}: {error}", reason="damaged") from error
@@ -131,20 +137,38 @@ def _check(tile: Tile, grid: TileGrid, n_robots: int, index: TileIndex) -> None:
         and np.isfinite(kernels.prior_mean).all()
         and (np.isfinite(kernels.prior_var) & (kernels.prior_var > 0)).all()
         and (tile.lean is None or tile.lean.shape == grid.lean_nodes)
+        and (tile.news is None or bool((tile.news >= 0.0).all() and (tile.news < np.inf).all()))
     )
     if not sound:
         raise MapFileError(f"tile {index} has rows or kernels that no map makes", reason="damaged")
 
 
-def _lean_of(data: bytes) -> NDArray[np.uint8] | None:
-    """The nodes in what follows a tile's columns; None where nothing does, or no lean."""
+def _news_bytes(grid: TileGrid) -> int:
+    return 2 * grid.blocks**3 * np.dtype(_NEWS.dtype).itemsize
+
+
+def _beside(
+    data: bytes, grid: TileGrid
+) -> tuple[NDArray[np.uint8] | None, NDArray[np.float32] | None] | None:
+    """The lean and the news in what follows a tile's columns, each None where the tile has none; None: it is neither."""
+    if not data:
+        return None, None
     if len(data) < _LEAN.size:
         return None
     shape = _LEAN.unpack_from(data)
-    if min(shape) < 2 or len(data) != _LEAN.size + shape[0] * shape[1] * shape[2]:
+    n_nodes = shape[0] * shape[1] * shape[2]
+    rest = data[_LEAN.size + n_nodes :]
+    if len(data) < _LEAN.size + n_nodes or len(rest) not in (0, _news_bytes(grid)):
         return None
-    nodes: NDArray[np.uint8] = np.frombuffer(data, np.uint8, offset=_LEAN.size).reshape(shape).copy()
-    return nodes
+    if min(shape) < 2 and not (max(shape) == 0 and rest):
+        return None
+    lean: NDArray[np.uint8] | None = None
+    if n_nodes:
+        lean = np.frombuffer(data, np.uint8, n_nodes, _LEAN.size).reshape(shape).copy()
+    if not rest:
+        return lean, None
+    news, _ = _numbers(rest, 0, _NEWS, 2 * grid.blocks**3)
+    return lean, news.reshape(2, grid.blocks, grid.blocks, grid.blocks)
 
 
 def _planes(array: NDArray[Any], column: _Column) -> bytes:

@@ -48,6 +48,7 @@ def make_tile(n_rows: int, n_kernels: int, seed: int = 0, n_robots: int = 3) -> 
         revision=int(rng.integers(0, 2**62)),
         stamp_ns=int(rng.integers(0, 2**62)),
         lean=rng.integers(0, 256, GRID.lean_nodes).astype(np.uint8) if seed % 2 else None,
+        news=rng.uniform(0, 9, (2, *[GRID.blocks] * 3)).astype(np.float32) if seed % 3 else None,
     )
 
 
@@ -55,8 +56,8 @@ def arrays_of(tile: Tile) -> list[np.ndarray[Any, Any]]:
     """Every array of a tile."""
     kernels = tile.kernels
     inner = [getattr(kernels.kernels, f.name) for f in dataclasses.fields(KernelSet)]
-    lean = [] if tile.lean is None else [tile.lean]
-    return [*tile.rows, *inner, kernels.level, kernels.prior_mean, kernels.prior_var, *lean]
+    beside = [array for array in (tile.lean, tile.news) if array is not None]
+    return [*tile.rows, *inner, kernels.level, kernels.prior_mean, kernels.prior_var, *beside]
 
 
 def assert_same(a: Tile, b: Tile) -> None:
@@ -71,6 +72,7 @@ def test_a_tile_comes_back_bit_for_bit(n_rows: int, n_kernels: int, seed: int) -
     tile = make_tile(n_rows, n_kernels, seed)
     index, again = decode_tile(encode_tile((-3, 0, 2**31 - 1), tile), GRID, 3)
     assert index == (-3, 0, 2**31 - 1)
+    assert (tile.lean is None, tile.news is None) == (again.lean is None, again.news is None)
     assert_same(tile, again)
 
 
