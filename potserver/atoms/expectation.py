@@ -1,8 +1,9 @@
 """What a dictionary's recordings teach to expect about a scan: learned from thin looks, asked about all other beams.
 
 Scans are thinned to few beams or few rings, and the net learns to tell what the rest of their beams met, and beams of the scans
-after them, which look behind things. A map keeps what it expects on a lattice, so the net is fitted through one: what it
-says at the eight nodes about a place is interpolated there as a map does it, with the lattice turned and shifted at random.
+after them, which look behind things. Each time the scene is varied, so that what is made up teaches about what is real. A map
+keeps what it expects on a lattice, so the net is fitted through one: what it says at the eight nodes about a place is
+interpolated there as a map does it, with the lattice turned and shifted at random.
 """
 
 from __future__ import annotations
@@ -14,10 +15,11 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
+from potserver.atoms.variation import AS_IT_IS, Variation, draw_variation
 from potserver.domain.tiles import LEAN_LEVEL_M, LEAN_M
 from potserver.domain.types import Bool, Float32, Float64, Scan
 from potserver.numerics.abhm.dispersions import one_torch_thread
-from potserver.numerics.beams import Beams, label_beams, limit_range
+from potserver.numerics.beams import Beams, cut_range, label_beams, limit_range
 from potserver.numerics.ground import LEAST_GROUND, LOWEST_EYE_M, Ground, ground_of
 from potserver.numerics.surroundings import N_FEATURES, Perceptron, Surroundings
 
@@ -28,11 +30,12 @@ _SEEN = 30_000  # beams, at most
 _ASKED = 180  # beams of each scan that are asked about
 _LATER = 2  # scans that are asked about too
 _GAP_M = 0.05  # before a hit, where nothing is free: the noise of a range
-# Real grounds are no planes: what is learned on made-up ones is told a wrong plane by so much (standard deviations).
-_OFF_M, _OFF_SLOPE = 0.04, 0.006
-_WIDTHS = (32, 32)
+# The ground of few hits is not that of all: a plane is told wrong by so much (standard deviations).
+_OFF_M, _OFF_SLOPE = 0.02, 0.002
+_WIDTHS = (48, 32)
 _DIGITS = 4  # kept of a weight behind the point
-_EPOCHS, _BATCH, _LEARNING_RATE, _RATE_OF_MORE = 5, 1024, 0.01, 0.003  # the last: of a net that goes on
+_EPOCHS, _BATCH, _LEARNING_RATE = 12, 1024, 0.01
+_EPOCHS_OF_MORE, _RATE_OF_MORE = 5, 0.003  # of a net that goes on
 _CORNERS = np.array(list(itertools.product((0, 1), repeat=3)))
 
 
@@ -54,7 +57,7 @@ def learn_expectation(
         max_range_m: Longer beams are cut.
         seed: Of all draws.
     """
-    lesson = _lesson_of_all(recordings, max_range_m, seed)
+    lesson = _lesson_of_all(recordings, max_range_m, seed, vary=True)
     if lesson is None:
         return None
     with one_torch_thread():
@@ -86,7 +89,7 @@ def learn_further(
         held_out: To judge by, in order.
         max_range_m, seed: As there.
     """
-    told, asked = (_lesson_of_all([some], max_range_m, seed) for some in (scans, held_out))
+    told, asked = (_lesson_of_all([some], max_range_m, seed, vary=False) for some in (scans, held_out))
     if told is None or asked is None:
         return None
     with one_torch_thread():
@@ -96,7 +99,10 @@ def learn_further(
     return Further(net, nll, min(before, default=float(np.log(2.0))), len(told.occupied))
 
 
-def _lesson_of_all(recordings: Iterable[Iterable[Scan]], max_range_m: float, seed: int) -> _Lesson | None:
+def _lesson_of_all(
+    recordings: Iterable[Iterable[Scan]], max_range_m: float, seed: int, *, vary: bool
+) -> _Lesson | None:
+    """All looks together; those at a place itself are not varied."""
     rng = np.random.default_rng(seed)
     lessons: list[_Lesson] = []
     for scans in recordings:
@@ -108,12 +114,12 @@ def _lesson_of_all(recordings: Iterable[Iterable[Scan]], max_range_m: float, see
                 (Beams(b.ends + s.origin - scan.origin, b.is_return), s.origin - scan.origin)
                 for b, s in zip(beams[after], upright[after], strict=True)
             ]
-            lessons += _lessons_of(beams[i], later, max_range_m, rng)
+            lessons += _lessons_of(beams[i], later, max_range_m, rng, vary=vary)
     return _Lesson(*(np.concatenate(columns) for columns in zip(*lessons, strict=True))) if lessons else None
 
 
 def _lessons_of(
-    beams: Beams, later: list[tuple[Beams, Float64]], reach_m: float, rng: np.random.Generator
+    beams: Beams, later: list[tuple[Beams, Float64]], reach_m: float, rng: np.random.Generator, *, vary: bool
 ) -> list[_Lesson]:
     """One of each way to thin a scan.
 
@@ -122,14 +128,18 @@ def _lessons_of(
         later: Beams of other scans, their ends relative to the same place, and (3,) m where they start.
         reach_m: Farther places are not asked about.
         rng: Of the draws.
+        vary: Each in another scene.
     """
     n = len(beams.ends)
     chosen = [rng.permutation(n) < max(n // share, 1) for share in _SHARES]
     chosen += [_in_rings(beams.ends, rings) for rings in _RINGS]
     out = []
     for seen in chosen:
+        scene = draw_variation(rng) if vary else AS_IT_IS
         drawn = rng.permutation(np.flatnonzero(seen))[:_SEEN]
-        view = beams.take(drawn)
+        view, _ = scene.seen(beams.take(drawn), np.zeros(3), rng)
+        view = cut_range(view, reach_m)
+        view = view._replace(ends=scene.lifted(view.ends))
         hits = view.ends[view.is_return]
         if len(hits) < LEAST_GROUND:
             continue
@@ -137,7 +147,7 @@ def _lessons_of(
         if -ground.height_m < LOWEST_EYE_M:
             continue
         others = [(beams.take(~seen), np.zeros(3)), *later]
-        places = [_places(asked, eye, rng) for asked, eye in others if len(asked.ends)]
+        places = [_places(asked, eye, scene, rng) for asked, eye in others if len(asked.ends)]
         if not places:
             continue
         points, occupied = (np.concatenate(columns) for columns in zip(*places, strict=True))
@@ -164,12 +174,12 @@ def _in_rings(ends: Float64, wanted: int) -> Bool:
     return np.asarray(ring.reshape(-1) % every == every // 2)
 
 
-def _places(beams: Beams, eye: Float64, rng: np.random.Generator) -> tuple[Float64, Bool]:
-    """Labelled places on some beams that start at `eye`, (3,) m."""
+def _places(beams: Beams, eye: Float64, scene: Variation, rng: np.random.Generator) -> tuple[Float64, Bool]:
+    """Labelled places in a scene, on some beams that start at `eye`, (3,) m."""
     drawn = rng.permutation(len(beams.ends))[:_ASKED]
-    about = Beams(beams.ends[drawn] - eye, beams.is_return[drawn])
-    labelled = label_beams(about, free_per_beam=1, gap_m=_GAP_M, rng=rng)
-    return labelled.points + eye, labelled.occupied
+    about, eye = scene.seen(beams.take(drawn), eye, rng)
+    labelled = label_beams(about._replace(ends=about.ends - eye), free_per_beam=1, gap_m=_GAP_M, rng=rng)
+    return scene.lifted(labelled.points + eye), labelled.occupied
 
 
 def _lesson(view: Surroundings, points: Float64, occupied: Bool, rng: np.random.Generator) -> _Lesson:
@@ -194,12 +204,12 @@ def _fit(lesson: _Lesson, seed: int, start: Perceptron | None = None) -> Percept
     net = _module(start)
     features, shares = torch.from_numpy(lesson.features), torch.from_numpy(lesson.shares)
     occupied = torch.from_numpy(lesson.occupied.astype(np.float32))
-    rate = _LEARNING_RATE if start is None else _RATE_OF_MORE
-    n_steps = _EPOCHS * -(-len(occupied) // _BATCH)
+    epochs, rate = (_EPOCHS, _LEARNING_RATE) if start is None else (_EPOCHS_OF_MORE, _RATE_OF_MORE)
+    n_steps = epochs * -(-len(occupied) // _BATCH)
     optimizer = torch.optim.Adam(net.parameters())
     pace = torch.optim.lr_scheduler.OneCycleLR(optimizer, rate, total_steps=n_steps)
     loss = torch.nn.BCEWithLogitsLoss()
-    for _ in range(_EPOCHS):
+    for _ in range(epochs):
         for batch in torch.randperm(len(occupied)).split(_BATCH):
             optimizer.zero_grad()
             loss(_log_odds(net, features[batch], shares[batch]), occupied[batch]).backward()

@@ -32,6 +32,8 @@ _NONE_M = -1.0  # range of an empty cell
 _AT_ONCE = 128  # places: their features stay in the processor's cache
 _QUICK = {"nnan", "ninf", "nsz", "arcp", "contract", "afn"}  # no `reassoc`: sums keep their order
 _FEET_M, _ROOM_M, _FAR_M = 0.2, 0.5, 5.0  # scales at which lengths are told apart
+# Where no beam came near, nothing is called sure: a beam is near that passes so far beside, or ends so far before.
+_BESIDE_M, _BEFORE_M, _UNSEEN_LOG_ODDS = 1.5, 1.2, 2.0
 
 
 class Surroundings(NamedTuple):
@@ -60,7 +62,7 @@ class Surroundings(NamedTuple):
         return out
 
     def expected(self, points: Float64, net: Perceptron) -> Float64:
-        """(N,) log-odds at (N, 3) places, m."""
+        """(N,) log-odds at (N, 3) places, m; between -2 and 2 where no beam came near."""
         out = np.empty(len(points))
         _expected(points, self.ground.below(points), *self[1:], *net, out)
         return out
@@ -185,6 +187,7 @@ def _of(x, scale):
 
 @nb.njit(nogil=True, fastmath=_QUICK, error_model="numpy", cache=True)
 def _features_at(point, h, beams, columns, by_beams, by_columns, f):
+    """Fill in the features; whether a beam came near."""
     x, y, z = point
     across = np.hypot(x, y)
     length = np.hypot(across, z)
@@ -194,13 +197,14 @@ def _features_at(point, h, beams, columns, by_beams, by_columns, f):
     column = i * _RANGES + _cell(across / _CELL_M, _RANGES)
     f[0], f[1], f[2] = _of(h, _FEET_M), _of(h, 1.0), 0.25 * min(max(h, -2.0), 6.0)
     f[3], f[4] = min(across / 25.0, 1.5), _of(across, _FAR_M)
-    n = _OF_PLACE
+    n, is_near = _OF_PLACE, False
     for side in range(_SIDES):
         c = beam if side == 0 else by_beams[side - 1, beam]
         if c >= 0 and _is_filled(beams, c, True):
             b = beams[c]
-            f[n] = _of(abs(_turned(b[0] - azimuth)) * across, _ROOM_M)
-            f[n + 1] = _of(abs(b[1] - elevation) * length, _ROOM_M)
+            beside, above = abs(_turned(b[0] - azimuth)) * across, abs(b[1] - elevation) * length
+            is_near |= beside**2 + above**2 < _BESIDE_M**2 and b[2] > length - _BEFORE_M
+            f[n], f[n + 1] = _of(beside, _ROOM_M), _of(above, _ROOM_M)
             f[n + 2], f[n + 3], f[n + 4] = _of(b[2] - length, 1.0), _of(b[3], _ROOM_M), b[4]
         else:
             f[n], f[n + 1], f[n + 2], f[n + 3], f[n + 4] = 1.0, 1.0, 0.0, 0.0, 0.0
@@ -215,6 +219,7 @@ def _features_at(point, h, beams, columns, by_beams, by_columns, f):
         else:
             f[n], f[n + 1], f[n + 2], f[n + 3] = 1.0, 0.0, 0.0, 0.0
         n += _OF_COLUMN
+    return is_near
 
 
 @nb.njit(nogil=True, fastmath=_QUICK, error_model="numpy", cache=True)
@@ -259,10 +264,14 @@ def _layer(x, weights, bias, out):
 def _expected(points, height, beams, columns, by_beams, by_columns, w1, b1, w2, b2, w3, b3, out):
     f, x = np.empty(N_FEATURES, np.float32), np.zeros((N_FEATURES, _AT_ONCE), np.float32)
     one, two = np.empty((len(b1), _AT_ONCE), np.float32), np.empty((len(b2), _AT_ONCE), np.float32)
+    most = np.empty(_AT_ONCE)
     for start in range(0, len(points), _AT_ONCE):
         n = min(_AT_ONCE, len(points) - start)
         for p in range(n):
-            _features_at(points[start + p], height[start + p], beams, columns, by_beams, by_columns, f)
+            is_near = _features_at(
+                points[start + p], height[start + p], beams, columns, by_beams, by_columns, f
+            )
+            most[p] = np.inf if is_near else _UNSEEN_LOG_ODDS
             for i in range(N_FEATURES):
                 x[i, p] = f[i]
         _layer(x, w1, b1, one)
@@ -271,4 +280,4 @@ def _expected(points, height, beams, columns, by_beams, by_columns, w1, b1, w2, 
             total = b3[0]
             for j in range(len(two)):
                 total += w3[j] * two[j, p]
-            out[start + p] = total
+            out[start + p] = min(max(total, -most[p]), most[p])

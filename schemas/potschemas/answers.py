@@ -63,7 +63,7 @@ OBSERVED_ACTIVATION = 0.05
 PRIOR_VAR = 100.0
 # By how much the known activation must be above what makes a point observed, for its evidence to count in full. A full lattice
 # sums to 3.4.
-ROOM, ROOM_IN_SOLID = 0.2, 2.0
+ROOM, ROOM_IN_SOLID = 1.0, 2.0
 
 
 @dataclasses.dataclass(frozen=True, slots=True)

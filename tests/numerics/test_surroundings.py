@@ -62,8 +62,10 @@ def test_features_are_bounded_wherever_one_asks() -> None:
 @pytest.mark.parametrize("widths", [(32, 32), (5, 3)])
 def test_the_net_is_two_layers_of_rectified_sums(widths: tuple[int, int]) -> None:
     rng = np.random.default_rng(7)
-    view, net = Surroundings.of(scene(rng), FLOOR), random_net(rng, widths)
-    places = rng.uniform(-15, 15, (301, 3))
+    ends = scene(rng, 301).ends
+    ends *= 20.0 / np.linalg.norm(ends, axis=1, keepdims=True)
+    view, net = Surroundings.of(Beams(ends, rng.random(301) < 0.8), FLOOR), random_net(rng, widths)
+    places = rng.uniform(0.1, 1.0, (301, 1)) * ends  # a beam came near
     x = view.features(places).astype(np.float64)
     one = np.maximum(x @ net.first + net.first_bias, 0)
     two = np.maximum(one @ net.second + net.second_bias, 0)
@@ -71,6 +73,20 @@ def test_the_net_is_two_layers_of_rectified_sums(widths: tuple[int, int]) -> Non
         view.expected(places, net), two @ net.last + net.last_bias, rtol=1e-4, atol=1e-3
     )
     assert len(view.expected(places[:0], net)) == 0
+
+
+def test_nothing_is_called_sure_where_no_beam_came_near() -> None:
+    rng = np.random.default_rng(9)
+    net = random_net(rng)._replace(last_bias=np.array([900.0], np.float32))  # sure of everything
+    wall = Beams(np.column_stack([np.full(400, 8.0), rng.uniform(-4, 4, (400, 2))]), np.ones(400, bool))
+    view = Surroundings.of(wall, FLOOR)
+    near = np.array([[4.0, 0.0, 0.0], [8.0, 0.0, 0.0], [8.8, 0.0, 0.0], [6.0, 4.0, 0.0]])
+    unseen = np.array(
+        [[10.0, 0.0, 0.0], [20.0, 2.0, 1.0], [-5.0, 0.0, 0.0], [5.0, 0.0, 6.0], [4.0, 6.0, 0.0]]
+    )
+    assert (view.expected(near, net) > 100.0).all()
+    assert (view.expected(unseen, net) == 2.0).all()
+    assert (view.expected(unseen, net._replace(last=-net.last, last_bias=-net.last_bias)) == -2.0).all()
 
 
 def test_a_net_of_other_features_is_not_sound() -> None:

@@ -19,11 +19,14 @@ from potserver.domain.dictionary import AtomDictionary
 from potserver.domain.types import Scan
 from potserver.errors import DictionaryError, PotserverError
 from potserver.numerics.surroundings import Perceptron
-from potserver.recordings import open_recording, to_scan
+from potserver.recordings import Reader, open_recording, to_scan
 
 COVERED = "near a kept atom"
 OVER_LIMIT = "beyond max_atoms"
-_TOLD_BY = 28  # scans of a recording, about, that expectations are learned from
+_TOLD_BY, _TOLD_BY_TOWN = (
+    28,
+    14,
+)  # scans of a recording, about, that expectations are learned from; of a further town
 
 
 @dataclasses.dataclass(slots=True)
@@ -48,14 +51,19 @@ class Built:
 
 
 def scan_tasks(recipe: Recipe, folder: Path) -> list[ScanTask]:
-    """Every scan that a recipe takes, in order.
+    """Every scan that a recipe takes atoms from, in order.
 
     Args:
         recipe: What to build.
         folder: Where its relative paths start.
     Raises:
-        DictionaryError: a recording cannot be opened, or has none of the scans asked for.
+        DictionaryError: a recording or town cannot be opened, or has none of the scans asked for.
     """
+    try:
+        for town in recipe.expect_too:
+            open_recording(town, Reader())
+    except DatasetError as error:
+        raise DictionaryError(str(error)) from error
     tasks: list[ScanTask] = []
     for index, recording in enumerate(recipe.recordings):
         found = located(recording, folder)
@@ -140,20 +148,23 @@ def build(
 
 
 def expectation_of(recipe: Recipe, tasks: list[ScanTask]) -> Perceptron | None:
-    """What the recordings of tasks teach to expect, by scans from all over each; None if none can tell."""
+    """What the recordings of tasks teach to expect, by scans from all over each; None if they cannot tell."""
     deep = {task.recording: task for task in tasks if task.dims != 2}
-    reach = max((task.settings.max_range_m for task in deep.values()), default=0.0)
-    scans = (_scans_about(task) for task in deep.values())
-    return learn_expectation(scans, max_range_m=reach, seed=recipe.seed)
+    if not deep:
+        return None
+    reach = max(task.settings.max_range_m for task in deep.values())
+    told = [_scans_of(task.dataset, task.reader, _TOLD_BY) for task in deep.values()]
+    told += [_scans_of(town, Reader(max_range_m=reach), _TOLD_BY_TOWN) for town in recipe.expect_too]
+    return learn_expectation(told, max_range_m=reach, seed=recipe.seed)
 
 
-def _scans_about(task: ScanTask) -> Iterator[Scan]:
-    """Some scans of a task's recording, evenly spread; what cannot be read is left out, for its own task reports it."""
+def _scans_of(dataset: str, reader: Reader, n: int) -> Iterator[Scan]:
+    """About n scans of a recording, evenly spread; what cannot be read is left out, for its own task reports it."""
     try:
-        recording = open_recording(task.dataset, task.reader)
+        recording = open_recording(dataset, reader)
     except (DatasetError, OSError):
         return
-    for number in range(0, len(recording), -(-len(recording) // _TOLD_BY)):
+    for number in range(0, len(recording), -(-len(recording) // n)):
         with contextlib.suppress(DatasetError, PotserverError, OSError):
             yield to_scan(recording[number], number)
 

@@ -72,6 +72,8 @@ class Recipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     tolerance_m: _NotNegative | None = None
     max_atoms: _AtLeastOne | None = None  # kept in each number of dimensions
     later_scans: Annotated[int, msgspec.Meta(ge=0)] = 2  # whose held-out beams also judge an atom
+    # towns beside the recordings in 3D, seen by other sensors perhaps: they teach what to expect, and give no atoms
+    expect_too: tuple[Annotated[str, msgspec.Meta(pattern=r"^town:")], ...] = ()
     seed: Annotated[int, msgspec.Meta(ge=0)] = 0
     quality: Quality = Quality()
     learner: dict[str, Any] = {}  # fields of LearningSettings, for all recordings

@@ -76,6 +76,20 @@ def test_a_dictionary_learns_what_to_expect_of_its_recordings_in_3d() -> None:
     assert plan().dictionary.expectation is None
 
 
+def test_further_towns_teach_what_to_expect_and_give_no_atoms() -> None:
+    street = {"dataset": "town:suburb:vlp16:40m:3", "scans": "0:1", "licence": "MIT", "learner": FAST}
+    with_it = {"expect_too": ["town:terraces:vlp16:30m:6"]}
+    tasks, more = (scan_tasks(recipe(street, **also), Path.cwd()) for also in ({}, with_it))
+    assert more == tasks
+    alone, net = (expectation_of(recipe(street, **also), tasks) for also in ({}, with_it))
+    assert alone is not None
+    assert net is not None
+    assert not np.array_equal(alone.first, net.first)
+    assert expectation_of(recipe(PLAN, **with_it), scan_tasks(recipe(PLAN), Path.cwd())) is None
+    with pytest.raises(DictionaryError, match="nowhere"):
+        scan_tasks(recipe(street, expect_too=["town:nowhere"]), Path.cwd())
+
+
 # --- one scan -----------------------------------------------------------------------------------------------
 
 

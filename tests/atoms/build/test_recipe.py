@@ -39,6 +39,7 @@ def test_the_builtin_recipe_learns_from_recordings_that_the_package_ships() -> N
         ({"recordings": [ROOMS | {"license": "MIT"}]}, "unknown field `license`"),
         ({"recordings": [ROOMS], "tolerance_m": -1.0}, ">= 0.0"),
         ({"recordings": [ROOMS], "max_atoms": 0}, ">= 1"),
+        ({"recordings": [ROOMS], "expect_too": ["logs/day1"]}, "^town:"),
         ({"recordings": [ROOMS | {"dims": 4}]}, "dims"),
         ({"recordings": [ROOMS | {"scans": 0}]}, "need at least 1"),
         ({"recordings": [ROOMS | {"scans": "1-5"}]}, "START:STOP:STEP"),
