@@ -85,7 +85,8 @@ def test_further_towns_teach_what_to_expect_and_give_no_atoms() -> None:
     assert alone is not None
     assert net is not None
     assert not np.array_equal(alone.first, net.first)
-    assert expectation_of(recipe(PLAN, **with_it), scan_tasks(recipe(PLAN), Path.cwd())) is None
+    flat = recipe(PLAN | {"dims": 2}, **with_it)
+    assert expectation_of(flat, scan_tasks(flat, Path.cwd())) is None
     with pytest.raises(DictionaryError, match="nowhere"):
         scan_tasks(recipe(street, expect_too=["town:nowhere"]), Path.cwd())
 
