@@ -1,7 +1,7 @@
 """A tile as bytes on the disk: bit for bit what it was, and compact.
 
 head     what the tile is: its index, revision, stamp, and how many rows and kernels follow
-body     the arrays, column by column, each number's bytes apart (all first bytes, then all second ones); then, if the tile has a
+body     the arrays, column by column, each number's bytes apart (all first bytes, then all second ones); then, if a tile has a
          lean or news, the lean's numbers of nodes (0 without one) and its nodes, and the news; deflated: what is alike in a
          column, such as the widths of a lattice's kernels or their places on it, then takes next to nothing
 seal     of head and body
@@ -65,7 +65,10 @@ def encode_tile(index: TileIndex, tile: Tile) -> bytes:
     if tile.lean is not None:
         columns.append(_LEAN.pack(*tile.lean.shape) + tile.lean.tobytes())
     if tile.news is not None:
-        columns += [b"" if tile.lean is not None else _LEAN.pack(0, 0, 0), _planes(tile.news.reshape(-1), _NEWS)]
+        columns += [
+            b"" if tile.lean is not None else _LEAN.pack(0, 0, 0),
+            _planes(tile.news.reshape(-1), _NEWS),
+        ]
     head = _HEAD.pack(*index, tile.revision, tile.stamp_ns, len(rows.kind), len(kernels))
     body = zlib.compress(b"".join(columns), _LEVEL)
     return sealed(head + body)
