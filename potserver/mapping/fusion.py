@@ -63,7 +63,7 @@ class FitEffort(NamedTuple):
 
     newton_steps: int = 3
     most_newton_steps: int = 6  # where the map is small and steps are cheap
-    gradient_steps: int = 8  # conjugate-gradient steps for each Newton step
+    gradient_steps: int = 6  # conjugate-gradient steps for each Newton step
     # Relative gain of the objective below which steps end, where they are not cheap: the next scan goes on.
     enough: float = 0.07
 
