@@ -250,9 +250,8 @@ def _compared(
     meant = _inside(known.indices, low, high)
     ours = np.array(present, np.int64).reshape(-1, 3)
     both = np.concatenate([ours, known.indices[meant]])
-    order = np.lexsort(
-        both.T
-    )  # stable: of equal ones the map's comes first, and what the asker said last comes last
+    # stable: of equal ones the map's comes first, and what the asker said last comes last
+    order = np.lexsort(both.T)
     ordered = both[order]
     is_first = np.ones(len(order), np.bool_)
     is_first[1:] = (ordered[1:] != ordered[:-1]).any(axis=1)

@@ -54,7 +54,6 @@ _UNSUPPORTED = 1e-5  # of a kernel's curvature: what no row within its reach lea
 _STALE = 0.125  # half-lives after which a tile that no scan touches is fitted again
 _MEMORY = 200.0  # looks that one place remembers; older ones give way
 _SATURATION = 20.0  # looks at one place that count in a solve; further ones repeat them
-_SETTLED = 1e-5  # relative gain of a step after which nothing is left to gain
 _CHEAP_VALUES = 60_000_000  # features that a solve may touch for more Newton steps than it must take
 
 
@@ -403,8 +402,9 @@ def _solve(region: Region, part: Part, options: FusionOptions, threads: int) -> 
     per_step = blocks.n_values * (2 + 2 * effort.gradient_steps)
     cheap = _CHEAP_VALUES // max(per_step, 1)
     n_newton = int(np.clip(cheap, effort.newton_steps, effort.most_newton_steps))
-    enough = effort.enough if n_newton == effort.newton_steps else _SETTLED
-    solver = Solver(n_newton, effort.gradient_steps, _LONGEST_STEP, enough=enough)
+    solver = Solver(n_newton, effort.gradient_steps, _LONGEST_STEP)
+    if n_newton == effort.newton_steps:
+        solver = solver._replace(enough=effort.enough)
     prior = Prior(
         region.kernels.prior_mean[local],
         region.kernels.prior_var[local],

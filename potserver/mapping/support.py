@@ -33,17 +33,14 @@ class Support(NamedTuple):
 
 
 def support_of(
-    blocks: Blocks, kind: UInt8, counts: Float32, threads: int, scale: NDArray[np.int8] | None = None
+    blocks: Blocks, kind: UInt8, counts: Float32, threads: int, scale: NDArray[np.int8] | int = 0
 ) -> Support:
-    """The support of a block's kernels by rows of these kinds and counts; by default all kernels are of scale 0."""
+    """The support of a block's kernels by rows of these kinds and counts; `scale` (K,) is of the kernels."""
     is_shadow = kind & evidence.KIND_MASK == evidence.SHADOW
     worth = np.minimum(counts, np.float32(1.0)) * np.float32(_WORTH_OF_HALF) ** evidence.halvings_of(kind)
     seen, unseen = (
         weight[blocks.order].astype(np.float32)
         for weight in (np.where(is_shadow, np.float32(0), worth), is_shadow & (counts > 0))
     )
-    support = Support(*two_diagonals(blocks, seen, unseen, threads=threads))
-    if scale is None:
-        return support
     narrower = np.float32(1.0 / _WORTH_OF_HALF) ** scale  # they reach as many rows of their own scale
-    return Support(support.seen * narrower, support.unseen * narrower)
+    return Support(*(sums * narrower for sums in two_diagonals(blocks, seen, unseen, threads=threads)))

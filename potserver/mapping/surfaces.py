@@ -78,6 +78,8 @@ def hits_of(
     faces = surface.normals(
         ends, ends / length[:, None], known - origin, _NORMAL_VOXELS * fine_m, planar=planar
     )
+    if n_scales == 1:
+        return Hits(ends, faces, np.zeros(len(ends), np.uint8))
     apart_m = angles_between(beams.ends, planar=planar)[beams.is_return] * length
     shown_m = np.maximum(
         _VOXEL_OF_BEAMS * apart_m / np.maximum(faces.cosine, _LEAST_COSINE), _VOXEL_OF_NOISE * faces.sigma_m
