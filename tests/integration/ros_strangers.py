@@ -45,9 +45,11 @@ class Stranger:
         until(lambda: publisher.pub.matching_status.matching, f"a subscriber of {topic}")
         publisher.publish(**{f.name: getattr(message, f.name) for f in dataclasses.fields(message) if f.init})
 
-    def subscribe(self, topic: str, kind: str, *, latched: bool = False) -> queue.Queue[Any]:
-        """Messages of a topic from now on; latched: and the last one before."""
-        inbox: queue.Queue[Any] = queue.Queue()
+    def subscribe(
+        self, topic: str, kind: str, *, latched: bool = False, inbox: queue.Queue[Any] | None = None
+    ) -> queue.Queue[Any]:
+        """Messages of a topic from now on, into this inbox or one of its own; latched: and the last one before."""
+        inbox = queue.Queue() if inbox is None else inbox
         self._subscribers.append(
             ROS2Subscriber(
                 topic,

@@ -139,7 +139,13 @@ def test_nav2_in_ten_minutes(terminals: Terminals, capsys: pytest.CaptureFixture
             )
             assert grid.data.max() > 50
             assert grid.data.min() == -1
-        for words in rest:
+        asks_for_counters, *others = rest
+
+        def counts_the_cloud() -> bool:
+            terminals.run(asks_for_counters)
+            return "ros.clouds.sent" in capsys.readouterr().out
+
+        until(counts_the_cloud, "the cloud to be counted")  # which is after its answer
+        for words in others:
             terminals.run(words)
-        assert "ros.clouds.sent" in capsys.readouterr().out
         terminals.end()
