@@ -64,7 +64,7 @@ class FitEffort(NamedTuple):
     most_newton_steps: int = 6  # where the map is small and steps are cheap
     gradient_steps: int = 6  # conjugate-gradient steps for each Newton step
     # Relative gain of the objective below which steps end, where they are not cheap: the next scan goes on.
-    enough: float = 0.07
+    enough: float = 0.02
 
 
 SCAN_EFFORT = FitEffort()
@@ -196,8 +196,9 @@ def _samples_of(look: Look, region: Region, options: FusionOptions, threads: int
     parts = [Samples(labelled.points - region.origin_m, kind, beam_weights(labelled))]
     if options.gone_odds:
         seen = evidence.see_through(
-            region.rows, beams, hits.faces, start, fine_m=grid.fine_m, odds=options.gone_odds, threads=threads
-        )
+            region.rows, beams, hits.faces, start, fine_m=grid.fine_m, odds=options.gone_odds,
+            beside_weight=options.faces.beside_weight, threads=threads,
+        )  # fmt: skip
         parts.append(Samples(*seen))
     parts.append(surface_samples(hits, start, options.faces, look.rng))
     return Samples.concatenate(parts)

@@ -26,9 +26,12 @@ class FaceSamples(NamedTuple):
     """How the overall map is made to end free space at faces, and knowledge behind them."""
 
     # Clearance of near samples along the face's normal, m. Lower ones sharpen faces and cost held-out ends, which lie on them.
-    near_m: tuple[float, float] = (0.03, 0.10)
-    near_sigmas: float = 2.0  # of the noise about the face, added to the clearance
+    near_m: tuple[float, float] = (0.04, 0.08)
+    near_sigmas: float = 1.0  # of the noise about the face, added to the clearance
     near_weight: float = 0.3  # looks of a near sample
+    beside_weight: float = (
+        0.5  # looks that a scan gives to free space beside the hits of a voxel, where beams pass them
+    )
     shadow_m: tuple[float, float] = (0.1, 1.2)  # depth of shadow samples behind the face, along its normal
 
 

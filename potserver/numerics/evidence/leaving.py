@@ -17,6 +17,8 @@ stays is asked against it; where next to none stays, nothing. So what lies betwe
 
 Lengths are those of the data: a beam passes what lies before the face that it ends on, across that face and by more than its
 noise. So floors and walls at a grazing angle are not passed, and what stood close before a wall is.
+
+The same passes tell where things end: a beam that passes beside the hits of what is still there is free as close to its edge.
 """
 
 from __future__ import annotations
@@ -34,10 +36,12 @@ from potserver.numerics.evidence.rows import (
     HIT,
     KIND_MASK,
     MISSED,
+    NEAR,
     PASSED,
     SCALE_SHIFT,
     Rows,
     is_alive,
+    kind_of,
     positions,
 )
 from potserver.numerics.flag_grid import FlagGrid
@@ -55,6 +59,10 @@ _ONE_SCAN = 3.0  # misses, at most: beams of one scan lie in the same ring, and 
 _ALONE = 0.2  # of the hits around a voxel: if no more stay, it goes along though no beam missed it
 _UNSEEN = 0.25  # of a hit that no echo confirms: so much it counts among those that stay
 _WALK = 0.75  # step of a walk along a beam, in voxels of hits
+_BESIDE_M = 0.06  # from hits, at least: closer beams may graze them
+_MOST_FOLLOWED = (
+    15_000  # beams of a scan; of more, every second, third ... is followed, and counts for those left out
+)
 _BLOCK_SHIFT = 1  # blocks of 2^shift voxels of hits along an edge, at least
 _SPANS = 8  # of beams; the number of threads plays no part in how they are cut
 
@@ -63,8 +71,8 @@ class SeenThrough(NamedTuple):
     """Samples that say where beams went through hits: tallies, and free space where things have left."""
 
     points: Float64  # (P, 3) m, in the rows' frame
-    kind: UInt8  # (P,) PASSED, MISSED or FREE
-    weight: Float64  # (P,) beams
+    kind: UInt8  # (P,) PASSED, MISSED, FREE or NEAR
+    weight: Float64  # (P,) beams, or looks of NEAR
 
     @staticmethod
     def nothing() -> SeenThrough:
@@ -126,7 +134,7 @@ def see_through(
     *,
     fine_m: float,
     odds: float,
-    most_followed: int = 15_000,
+    beside_weight: float = 0.0,
     threads: int = 1,
 ) -> SeenThrough:
     """Take out hits that have left, in place, and say what else the beams of a scan tell about hits that they pass through.
@@ -142,10 +150,11 @@ def see_through(
         origin: (3,) m, the beams' start in the rows' frame.
         fine_m: The resolution.
         odds: Against missing what is still there; beyond them it has left.
-        most_followed: Beams. Of more, every second, third ... is followed, and counts for those left out.
+        beside_weight: Looks of free space that beams of the scan give beside the hits of a voxel, all together.
         threads: Threads to spread the beams over.
     Returns:
-        Samples to add: tallies at the centres of their voxels, free space where beams passed the rows that were taken out.
+        Samples to add: tallies at the centres of their voxels, free space where beams passed the rows that were taken out, and
+        near samples on the beams that passed beside hits of what is still there.
     """
     hit_rows = np.flatnonzero(rows.occupied & is_alive(rows))
     ends = beams.ends + origin
@@ -155,7 +164,7 @@ def see_through(
     if len(voxel) == 0 or len(ends) == 0:
         return SeenThrough.nothing()
     hits = _Hits.of(voxel, np.concatenate([echoes.hits.at, positions(known, fine_m)]))
-    every = -(-len(ends) // most_followed)
+    every = -(-len(ends) // _MOST_FOLLOWED)
     before = np.zeros(len(ends))
     before[beams.is_return] = echoes.margin_m / np.maximum(faces.cosine, _LEAST_COSINE)
     passes = _follow(
@@ -181,11 +190,51 @@ def see_through(
     where = positions(rows.take(hit_rows[free - len(echoes.margin_m)]), fine_m)
     _take_out(rows, tallies, there, np.flatnonzero(gone))
     centres = (hits.voxel + 0.5) * (0.5 * fine_m)
+    is_known = np.zeros(len(voxel), bool)  # of voxels of this scan's echoes alone no beam says where they end
+    is_known[there[there >= len(echoes.margin_m)]] = True
+    scale = np.concatenate([np.zeros(len(echoes.margin_m), np.uint8), known.scale])
+    beside = _beside(
+        _Passes(passes.hit[is_known[passes.hit]], passes.beam[is_known[passes.hit]]),
+        ends[::every], origin, hits, tallies, scale, beside_weight,
+    )  # fmt: skip
     return SeenThrough(
-        np.concatenate([centres[there], centres[still], where]),
-        np.repeat(np.array([PASSED, MISSED, FREE], np.uint8), [len(there), len(still), len(free)]),
-        np.concatenate([(tallies.missed + passing)[there], new_misses[~has_left], in_a_row[has_left]]),
+        np.concatenate([centres[there], centres[still], where, beside.points]),
+        np.concatenate(
+            [
+                np.repeat(np.array([PASSED, MISSED, FREE], np.uint8), [len(there), len(still), len(free)]),
+                beside.kind,
+            ]
+        ),
+        np.concatenate(
+            [(tallies.missed + passing)[there], new_misses[~has_left], in_a_row[has_left], beside.weight]
+        ),
     )
+
+
+def _beside(
+    passes: _Passes,
+    ends: Float64,
+    origin: Float64,
+    hits: _Hits,
+    tallies: _Tallies,
+    scale: UInt8,
+    weight: float,
+) -> SeenThrough:
+    """Near samples where beams are closest to hits that they pass beside.
+
+    What lets most beams through is thin, and there is more room beside it than it takes: it has so much less weight.
+    """
+    if not weight:
+        return SeenThrough.nothing()
+    hit, beam = passes
+    along = ends[beam] - origin
+    along /= np.linalg.norm(along, axis=1)[:, None]
+    closest = origin + np.einsum("ij,ij->i", hits.at[hit] - origin, along)[:, None] * along
+    is_clear = np.linalg.norm(closest - hits.at[hit], axis=1) >= _BESIDE_M
+    hit, closest = hit[is_clear], closest[is_clear]
+    solid = tallies.hits[hit] / (tallies.hits[hit] + tallies.passed[hit])
+    each = weight * solid / np.bincount(hit, minlength=len(scale))[hit]
+    return SeenThrough(closest, kind_of(NEAR, scale[hit]), each)
 
 
 def _take_out(rows: Rows, tallies: _Tallies, there: Int64, gone: Int64) -> None:

@@ -12,12 +12,14 @@ from potserver.numerics.evidence import (
     FREE,
     HIT,
     MISSED,
+    NEAR,
     PASSED,
     Rows,
     SeenThrough,
     add,
     is_alive,
     kind_of,
+    leaving,
     positions,
     see_through,
 )
@@ -152,11 +154,42 @@ def test_beams_that_graze_a_surface_leave_it() -> None:
     assert _weight(rows, HIT) == 50.0
 
 
-def test_beams_left_out_are_stood_for() -> None:
+def _passing(*aside_m: float) -> list[list[float]]:
+    """Ends of beams that pass so far beside the place, 7 m farther."""
+    return [[10.0, (0.01 + aside) * 10.0 / 3.0, 0.1 / 3.0] for aside in aside_m]
+
+
+@pytest.mark.parametrize("passed", [0.0, 4.0])
+def test_space_is_free_where_beams_pass_close_beside_hits(passed: float) -> None:
+    """One beam echoes there, two pass: a thing that lets every second beam through gets half the weight beside it."""
+    place = np.array(PLACE)
+    rows = rows_of(place, kind_of(HIT, np.array([1], np.uint8)), [4.0])
+    rows, _ = add(rows, place, np.array([PASSED]), np.array([passed]), FINE_M)
+    ends = [*PLACE, *_passing(0.08, 0.12)]
+    seen = _see_through(rows, ends, [True, False, False], beside_weight=0.5)
+    is_near = seen.kind == kind_of(NEAR, np.array([1], np.uint8))
+    np.testing.assert_allclose(seen.weight[is_near], 0.5 * 4.0 / (4.0 + passed) / 2.0, rtol=1e-6)
+    apart = np.linalg.norm(seen.points[is_near] - place, axis=1)
+    np.testing.assert_allclose(apart, [0.08, 0.12], atol=2e-3)
+    assert np.abs(np.cross(seen.points[is_near], ends[1:])).max() < 0.01, "on their beams"
+
+
+@pytest.mark.parametrize(("aside_m", "echoes"), [(0.04, True), (0.1, False)])
+def test_beams_that_may_graze_and_hits_without_an_echo_say_nothing_of_edges(
+    aside_m: float, echoes: bool
+) -> None:
+    ends = [*(PLACE if echoes else []), *_passing(aside_m)]
+    seen = _see_through(rows_of(PLACE, True, [4.0]), ends, [True] * echoes + [False], beside_weight=0.5)
+    assert len(seen.kind) == 1
+    assert seen.kind[0] == (PASSED if echoes else MISSED)
+
+
+def test_beams_left_out_are_stood_for(monkeypatch: pytest.MonkeyPatch) -> None:
     one, two = rows_of(PLACE, True), rows_of(PLACE, True)
     ends = _fan(1)
     all_of_them = _see_through(one, np.repeat(ends, 40, axis=0), False)
-    a_half = _see_through(two, np.repeat(ends, 40, axis=0), False, most_followed=20)
+    monkeypatch.setattr(leaving, "_MOST_FOLLOWED", 20)
+    a_half = _see_through(two, np.repeat(ends, 40, axis=0), False)
     np.testing.assert_array_equal(one.sums, two.sums)
     np.testing.assert_array_equal(all_of_them.weight, a_half.weight)
 
