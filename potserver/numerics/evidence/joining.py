@@ -106,6 +106,7 @@ def _join_light(rows, gained, left, n_old, source, fine_m, first, last, part, in
         wide: The same in blocks, which are looked up faster.
     """
     voxel, kind, sums, sources = rows
+    most = _heaviest(kind, sums, index)
     place = np.empty(3, np.int64)
     for r in range(len(kind)):
         w = sums[r, 3]
@@ -130,14 +131,16 @@ def _join_light(rows, gained, left, n_old, source, fine_m, first, last, part, in
                 factor = _OLD_FREE
             elif not may_be_around(hits, place, _CLEAR):
                 factor = _BESIDE_IN_THE_CLEAR
-        to = _nearest_around(rows, left, edge, r, 1, factor * w, index)
+        to = _nearest_around(rows, left, edge, r, 1, factor * w, index, most)
         if to < 0 and factor == _BESIDE_IN_THE_CLEAR and not may_be_around(wide, place, _WIDE_CLEAR):
-            to = _nearest_around(rows, left, edge, r, 2, _AWAY_IN_THE_CLEAR * w, index)
+            to = _nearest_around(rows, left, edge, r, 2, _AWAY_IN_THE_CLEAR * w, index, most)
         if to < 0:
             continue
         for c in range(3):
             sums[to, c] += sums[r, c] + w * (voxel[r, c] - voxel[to, c]) * edge
         sums[to, 3] += w
+        cell = index.number[to]
+        most[np.int64(is_hit), cell] = max(most[np.int64(is_hit), cell], sums[to, 3])
         gained[to] += gained[r]
         left[r] = False
 
@@ -153,9 +156,26 @@ def _is_between(voxel, shift, first, last):
 
 
 @nb.njit(nogil=True, error_model="numpy", cache=True)
-def _nearest_around(rows, left, edge, r, reach, least_weight, index):
-    """Of the other rows of its kind and source within `reach` voxels of row r, the nearest of at least such weight; or -1."""
+def _heaviest(kind, sums, index):
+    """(2, C) what the heaviest row of free space, and of hits, of each cell weighs: in most none is heavy enough."""
+    out = np.zeros((2, len(index.head)), np.float32)
+    for r in range(len(kind)):
+        sort, cell = kind[r] & KIND_MASK, index.number[r]
+        if sort in (HIT, FREE):
+            is_hit = np.int64(sort == HIT)
+            out[is_hit, cell] = max(out[is_hit, cell], sums[r, 3])
+    return out
+
+
+@nb.njit(nogil=True, error_model="numpy", cache=True)
+def _nearest_around(rows, left, edge, r, reach, least_weight, index, most):
+    """Of the other rows of its kind and source within `reach` voxels of row r, the nearest of at least such weight; or -1.
+
+    Args:
+        most: See `_heaviest`.
+    """
     voxel, kind, sums, sources = rows
+    heaviest = most[np.int64(kind[r] & KIND_MASK == HIT)]
     _, following, head, keys, table = index
     shift, scale = np.int64(kind[r] & 1), kind[r] >> SCALE_SHIFT
     x, y, z = np.int64(voxel[r, 0]), np.int64(voxel[r, 1]), np.int64(voxel[r, 2])
@@ -165,7 +185,7 @@ def _nearest_around(rows, left, edge, r, reach, least_weight, index):
         for cy in range((y - reach) >> shift, ((y + reach) >> shift) + 1):
             for cz in range((z - reach) >> shift, ((z + reach) >> shift) + 1):
                 cell = table[find(table, keys, pack(scale, cx, cy, cz))]
-                if cell < 0:
+                if cell < 0 or heaviest[cell] < least_weight:
                     continue
                 q = head[cell]
                 while q >= 0:
