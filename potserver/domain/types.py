@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from enum import Enum
+from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -164,7 +165,8 @@ class KernelSet:
 
     def moved(self, by_m: Float64) -> KernelSet:
         """The same kernels in a frame whose origin lies at -`by_m`, (3,) m, of this one."""
-        return self.replace(hinge_mean=self.hinge_mean + by_m)
+        arrays = {name: getattr(self, name) for name in KERNEL_ARRAYS}
+        return KernelSet._checked(arrays | {"hinge_mean": self.hinge_mean + by_m})
 
     @staticmethod
     def concatenate(sets: list[KernelSet]) -> KernelSet:
@@ -194,6 +196,7 @@ class KernelSet:
         return KernelSet(**{name: getattr(record, name) for name in KERNEL_ARRAYS})
 
     @staticmethod
+    @cache
     def empty() -> KernelSet:
         """No kernels."""
         z = np.zeros(0, np.float32)
