@@ -31,7 +31,7 @@ from potserver.numerics.kernel_index import KernelIndex
 from potserver.numerics.lean import Lean, LeanTable, lean_of
 from potserver.numerics.threads import parallel_map, spans
 
-_END_OF_RAY = 1e-5  # survival below which a ray ends: the share by which a moment or a probability may be off
+_END_OF_RAY = 1e-7  # survival below which a ray ends: the share by which a moment or a probability may be off
 # Length of the stretch of a ray that shares a list of kernels, in reaches of a kernel; measured.
 _BLOCK_REACHES = 3.0
 _BLOCK_STEPS = (4, 128)  # the least and the most steps of such a stretch
