@@ -67,6 +67,11 @@ class MappedFile:
             self._record[:] = start, start + n_bytes, 0
         weakref.finalize(self.buffer, _forget, self._record).atexit = False
 
+    def let_go(self) -> None:
+        """Take it out of this process's memory; whoever reads there brings it back."""
+        if hasattr(mmap, "MADV_DONTNEED"):
+            self.buffer.madvise(mmap.MADV_DONTNEED)
+
     @property
     def is_lost(self) -> bool:
         """The disk did not read back a page that somebody touched: what was computed from here may be wrong, for ever."""

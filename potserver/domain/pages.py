@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import collections
 import dataclasses
+import math
 import mmap
 import os
 import tempfile
@@ -34,7 +35,9 @@ _SEGMENT_BYTES = 256 * 2**20  # of the file are mapped at once; what was not wri
 _ALIGNED = 64  # bytes: a line of the processor's cache
 _LEAST_BYTES = _ALIGNED  # smaller arrays would take no less on a page
 _READY_AT_ONCE = 64  # parts of a map that is read
-_AT_ONCE = 8 * 2**20  # bytes below the limit that are aimed at: snapshots are indexed anew each time
+_AT_ONCE = 8 * 2**20  # bytes that are moved together: snapshots are indexed anew each time
+# What so many scans have left alone goes to pages too, of a map that takes more than this: no scan brings it back soon.
+_COLD_SCANS, _SMALL_BYTES = 64, 64 * 2**20
 
 
 class _Extent(np.ndarray[Any, np.dtype[np.uint8]]):
@@ -52,6 +55,13 @@ class _Extent(np.ndarray[Any, np.dtype[np.uint8]]):
 class _Run(NamedTuple):
     start: int
     n_bytes: int
+
+
+class _Resident(NamedTuple):
+    """A part in memory."""
+
+    n_bytes: int
+    turn: int  # when it was changed
 
 
 class PageFile:
@@ -114,6 +124,11 @@ class PageFile:
                 self._extents.append(weakref.ref(extent))
                 self._is_damaged = self._is_damaged or not extent.is_sound
                 return
+
+    def let_go(self) -> None:
+        """Take what was read of the file out of this process's memory; the system still has what it needs to bring it back."""
+        for _, segment in self._segments:
+            segment.let_go()
 
     def check(self) -> None:
         """To be asked when something was computed from arrays here; from any thread.
@@ -182,7 +197,7 @@ class PageFile:
 
 
 class Pages:
-    """Keeps one map's tiles in memory up to a limit, and moves to pages what was changed longest ago."""
+    """Keeps of one map's tiles in memory what scans change, up to a limit, and moves to pages what was changed longest ago."""
 
     def __init__(self, folder: Path, max_resident_bytes: int) -> None:
         """Use a folder for the page file.
@@ -194,34 +209,52 @@ class Pages:
         self.max_resident_bytes = max_resident_bytes
         self.file = PageFile(folder)
         self._seen: TiledMap | None = None  # as it was last
-        self._resident: dict[TileIndex, int] = {}  # bytes of each part, last changed last
+        self._resident: dict[TileIndex, _Resident] = {}  # the parts, last changed last
+        self._turn = 0  # of `relieve`, one a scan
 
     def relieve(self, tiled: TiledMap) -> TiledMap:
         """The same map with its coldest parts on pages, if it has more in memory than it may; else the one that was given.
 
+        To be called after each scan.
+
         Raises:
             OSError: the disk refuses; the map is as it was.
         """
-        self.verify(tiled)
-        self.file.scrub()
-        self._look(tiled)
-        n_bytes = sum(self._resident.values())
-        if n_bytes <= self.max_resident_bytes:
+        self._turn += 1
+        n_bytes = self._look(tiled)
+        if n_bytes > self.max_resident_bytes:
+            return self._moved(tiled, self._coldest(n_bytes - max(self.max_resident_bytes - _AT_ONCE, 0)))
+        cold = self._coldest(min(n_bytes - _SMALL_BYTES, _AT_ONCE), self._turn - _COLD_SCANS)
+        is_worth_it = sum(self._resident[number].n_bytes for number in cold) >= _AT_ONCE
+        return self._moved(tiled, cold) if is_worth_it else tiled
+
+    def _coldest(self, n_bytes: int, until: float = math.inf) -> list[TileIndex]:
+        """Parts of so many bytes, if there are as many that were changed at no later turn."""
+        found = []
+        for number, part in self._resident.items():
+            if n_bytes <= 0 or part.turn > until:
+                break
+            found.append(number)
+            n_bytes -= part.n_bytes
+        return found
+
+    def _moved(self, tiled: TiledMap, numbers: list[TileIndex]) -> TiledMap:
+        if not numbers:
             return tiled
         tiles, parts = dict(tiled.tiles), dict(tiled.parts)
-        moved = []
-        for number, of_part in self._resident.items():
-            if n_bytes <= max(self.max_resident_bytes - _AT_ONCE, 0):
-                break
+        for number in numbers:
             members = {index: tiles[index] for index in tiles_of_part(number) if index in tiles}
             tiles_now, parts[number] = self._move(tuple(members.values()), parts[number])
             tiles.update(zip(members, tiles_now, strict=True))
-            moved.append(number)
-            n_bytes -= of_part
-        for number in moved:
+        for number in numbers:
             del self._resident[number]
         self._seen = tiled._replace(tiles=tiles, parts=parts)
         return self._seen
+
+    @property
+    def read_bytes(self) -> int:
+        """Of a map that is being read, what stays in memory: no scan has touched it."""
+        return min(self.max_resident_bytes, _SMALL_BYTES)
 
     def keep(self, tile: Tile) -> Tile:
         """A tile of a map that is being read, on pages.
@@ -244,9 +277,8 @@ class Pages:
         tiled, parts = empty, list(by_part.values())
         for start in range(0, len(parts), _READY_AT_ONCE):
             some = parts[start : start + _READY_AT_ONCE]
-            tiled = self.relieve(
-                tiled.with_tiles({index: tile for part in some for index, tile in part.items()})
-            )
+            tiled = tiled.with_tiles({index: tile for part in some for index, tile in part.items()})
+            tiled = self._moved(tiled, self._coldest(self._look(tiled) - self.read_bytes))
         return tiled._replace(
             tiles={index: tiled.tiles[index] for index in tiles}
         )  # in the order of the file
@@ -265,16 +297,20 @@ class Pages:
             if seen is not None and number in seen.parts and number not in self._resident:
                 self.file.verify(_members(seen, number), *_heavy(seen.parts[number]))
 
-    def _look(self, tiled: TiledMap) -> None:
-        """Note which parts have changed since the last time, and what they take."""
+    def _look(self, tiled: TiledMap) -> int:
+        """Note which parts have changed since the last time, and what they take; bytes of all that are in memory."""
+        self.verify(tiled)
+        self.file.scrub()
+        self.file.let_go()
         for number, part in self._changed(tiled):
             self._resident.pop(number, None)
             n_bytes = sum(array.nbytes for array in _in_memory(_members(tiled, number), *_heavy(part)))
             if n_bytes:
-                self._resident[number] = n_bytes
+                self._resident[number] = _Resident(n_bytes, self._turn)
         for number in [number for number in self._resident if number not in tiled.parts]:
             del self._resident[number]
         self._seen = tiled
+        return sum(part.n_bytes for part in self._resident.values())
 
     def _changed(self, tiled: TiledMap) -> list[tuple[TileIndex, MapPart]]:
         seen = {} if self._seen is None else self._seen.parts

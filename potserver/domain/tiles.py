@@ -75,7 +75,12 @@ class MapKernels:
 
     def moved(self, by_m: Float64) -> MapKernels:
         """The same kernels in a frame whose origin lies at -`by_m`, (3,) m, of this one."""
-        return dataclasses.replace(self, kernels=self.kernels.moved(by_m))
+        return MapKernels(
+            kernels=self.kernels.moved(by_m),
+            level=self.level,
+            prior_mean=self.prior_mean,
+            prior_var=self.prior_var,
+        )
 
     @staticmethod
     def concatenate(sets: list[MapKernels]) -> MapKernels:

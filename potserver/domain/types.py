@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from enum import Enum
+from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -124,27 +125,11 @@ class KernelSet:
     weight_var: Float32  # (K,) log-odds^2, > 0
 
     def __post_init__(self) -> None:
-        k = len(self.hinge_mean)
-        for name, shape in (
-            ("hinge_mean", (k, 3)),
-            ("hinge_var", (k, 3)),
-            ("gamma_shape", (k,)),
-            ("gamma_rate", (k,)),
-            ("weight_mean", (k,)),
-            ("weight_var", (k,)),
-        ):
-            array = getattr(self, name)
-            if array.shape != shape:
-                raise ShapeError(f"{name}: {array.shape}, need {shape}")
-            if not np.isfinite(array).all():
-                raise ShapeError(f"{name}: NaN or infinite values")
-            view = array.view()
+        for name in KERNEL_ARRAYS:
+            view = getattr(self, name).view()
+            _check_kernels(name, view, len(self.hinge_mean))
             view.flags.writeable = False  # kernels are shared between threads
             object.__setattr__(self, name, view)
-        if (self.gamma_shape <= 0).any() or (self.gamma_rate <= 0).any():
-            raise ShapeError("gamma_shape and gamma_rate must be > 0")
-        if (self.weight_var < 0).any() or (self.hinge_var < 0).any():
-            raise ShapeError("variances must be >= 0")
 
     def __len__(self) -> int:
         return len(self.hinge_mean)
@@ -159,12 +144,20 @@ class KernelSet:
         return KernelSet._checked({name: getattr(self, name)[index] for name in KERNEL_ARRAYS})
 
     def replace(self, **arrays: NDArray[np.floating]) -> KernelSet:
-        """A copy with some arrays exchanged."""
-        return dataclasses.replace(self, **arrays)  # type: ignore[arg-type]
+        """A copy with some arrays exchanged.
+
+        Raises:
+            ShapeError: as on construction.
+        """
+        for name, array in arrays.items():
+            _check_kernels(name, array, len(self))
+        views = {name: array.view() for name, array in arrays.items()}
+        return KernelSet._checked({name: getattr(self, name) for name in KERNEL_ARRAYS} | views)
 
     def moved(self, by_m: Float64) -> KernelSet:
         """The same kernels in a frame whose origin lies at -`by_m`, (3,) m, of this one."""
-        return self.replace(hinge_mean=self.hinge_mean + by_m)
+        arrays = {name: getattr(self, name) for name in KERNEL_ARRAYS}
+        return KernelSet._checked(arrays | {"hinge_mean": self.hinge_mean + by_m})
 
     @staticmethod
     def concatenate(sets: list[KernelSet]) -> KernelSet:
@@ -194,6 +187,7 @@ class KernelSet:
         return KernelSet(**{name: getattr(record, name) for name in KERNEL_ARRAYS})
 
     @staticmethod
+    @cache
     def empty() -> KernelSet:
         """No kernels."""
         z = np.zeros(0, np.float32)
@@ -208,6 +202,19 @@ class KernelSet:
 
 
 KERNEL_ARRAYS = tuple(field.name for field in dataclasses.fields(KernelSet))  # by name
+
+
+def _check_kernels(name: str, array: NDArray[np.floating], k: int) -> None:
+    """One array of K kernels."""
+    shape = (k, 3) if name in ("hinge_mean", "hinge_var") else (k,)
+    if array.shape != shape:
+        raise ShapeError(f"{name}: {array.shape}, need {shape}")
+    if not np.isfinite(array).all():
+        raise ShapeError(f"{name}: NaN or infinite values")
+    if name in ("gamma_shape", "gamma_rate") and (array <= 0).any():
+        raise ShapeError("gamma_shape and gamma_rate must be > 0")
+    if name in ("weight_var", "hinge_var") and (array < 0).any():
+        raise ShapeError("variances must be >= 0")
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False, kw_only=True)

@@ -19,6 +19,8 @@ def gamma_of_spacing(spacing_m: float) -> float:
 def kernels_at(hinge: Float64, spacing_m: float, prior_var: float) -> KernelSet:
     """Kernels of a spacing's width at (K, 3) m, weight 0 with the prior variance, log-odds^2."""
     k = len(hinge)
+    if not k:
+        return KernelSet.empty()
     return KernelSet(
         hinge_mean=hinge,
         hinge_var=np.full((k, 3), spacing_m**2 / 12.0, np.float32),  # uniform in the voxel

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from typing import NamedTuple, NoReturn
 
@@ -9,10 +10,20 @@ import numba as nb
 import numpy as np
 
 from potserver.numerics.arrays import Float64, Int64
-from potserver.numerics.bricks import BYTES_OF_ROW, HALO, STARTS, WINDOW, Lattice, LatticeBricks, bricks_along
+from potserver.numerics.bricks import (
+    BYTES_OF_ROW,
+    HALO,
+    ROWS,
+    STARTS,
+    WINDOW,
+    Lattice,
+    LatticeBricks,
+    bricks_along,
+)
 from potserver.numerics.simd import load_f64, load_i32, load_i64, store_i64
 from potserver.numerics.voxel_hash import empty_table
 
+_BYTES_OF_NUMBERS = 2 * ROWS**2  # of the rows of a brick
 _REACH = WINDOW // 2  # spacings: farther nodes are in no window
 
 
@@ -45,10 +56,8 @@ class BrickMap:
             by_lattice.setdefault(found.lattice, []).append(found)
         # sorted: sums are the same to the bit whichever part came first
         self._groups = sorted(by_lattice.items(), key=lambda item: _order(item[0]))
-        records = [_lattice_record(lattice, group) for lattice, group in self._groups]
-        self._lattices = np.array(records, np.float64).reshape(-1, len(_LATTICE))
-        own = [_brick_records(n, found) for n, (_, group) in enumerate(self._groups) for found in group]
-        self._records = np.concatenate([np.zeros((0, len(_BRICK)), np.int64), *own])
+        self._lattices = _lattice_records(self._groups)
+        self._records = _brick_records([group for _, group in self._groups])
         self._hash = empty_table(len(self._records))
         _enter_all(self._records, self._hash)
         self.table = BrickTable(
@@ -77,6 +86,11 @@ def _order(lattice: Lattice) -> tuple[float, ...]:
     return (lattice.spacing_m, lattice.gamma, *(lattice.plane or ()))
 
 
+def _lattice_records(groups: list[tuple[Lattice, list[LatticeBricks]]]) -> Float64:
+    records = [_lattice_record(lattice, group) for lattice, group in groups]
+    return np.array(records, np.float64).reshape(-1, len(_LATTICE))
+
+
 def _lattice_record(lattice: Lattice, bricks: list[LatticeBricks]) -> list[float]:
     spacing = lattice.spacing_m
     phase = np.full(3, 0.5)
@@ -87,9 +101,9 @@ def _lattice_record(lattice: Lattice, bricks: list[LatticeBricks]) -> list[float
         1.0 / spacing,
         *phase,
         lattice.gamma * spacing**2,
-        np.sqrt(0.5 * np.pi / lattice.gamma),
-        *(np.min([found.lower for found in bricks], axis=0) - _REACH * spacing),
-        *(np.max([found.upper for found in bricks], axis=0) + _REACH * spacing),
+        math.sqrt(0.5 * math.pi / lattice.gamma),
+        *(np.array([found.lower for found in bricks]).min(axis=0) - _REACH * spacing),
+        *(np.array([found.upper for found in bricks]).max(axis=0) + _REACH * spacing),
         lattice.nodes,
         1.0 / lattice.nodes,
         *bricks_along(lattice.nodes),
@@ -97,13 +111,24 @@ def _lattice_record(lattice: Lattice, bricks: list[LatticeBricks]) -> list[float
     ]
 
 
-def _brick_records(number: int, found: LatticeBricks) -> Int64:
-    n = len(found.first)
-    records = np.empty((n, len(_BRICK)), np.int64)
-    records[:, 0], records[:, 1:4] = number, found.place
-    records[:, 4] = found.rows.ctypes.data + found.first * BYTES_OF_ROW
-    records[:, 5] = found.row_of.ctypes.data + np.arange(n) * found.row_of[0].nbytes
-    records[:, 6], records[:, 7] = found.layers, 0
+def _brick_records(groups: list[list[LatticeBricks]]) -> Int64:
+    """A record a brick of all groups, in order. At once: a kilometre has hundreds of parts, and each scan makes a new map."""
+    parts = [(number, found) for number, group in enumerate(groups) for found in group]
+    counts = [len(found.first) for _, found in parts]
+    records = np.zeros((sum(counts), len(_BRICK)), np.int64)
+    if not parts:
+        return records
+    # of each part: the number of its lattice, where its rows are, and where their numbers
+    of_part = np.array(
+        [(n, found.rows.ctypes.data, found.row_of.ctypes.data) for n, found in parts], np.int64
+    )
+    lattice, rows, row_of = np.repeat(of_part, counts, axis=0).T
+    in_part = np.arange(len(records)) - np.repeat(np.cumsum(counts) - counts, counts)
+    first = np.concatenate([found.first for _, found in parts])
+    records[:, 0] = lattice
+    records[:, 1:4] = np.concatenate([found.place for _, found in parts])
+    records[:, 4], records[:, 5] = rows + first * BYTES_OF_ROW, row_of + in_part * _BYTES_OF_NUMBERS
+    records[:, 6] = np.concatenate([found.layers for _, found in parts])
     return records
 
 

@@ -356,7 +356,7 @@ def _read(
         while some := rows.fetchmany(_AT_ONCE):
             for row, (index, tile) in zip(some, parallel_map(decoded, some, threads, "files"), strict=True):
                 n_resident += tile.n_bytes
-                if pages is not None and n_resident > pages.max_resident_bytes:
+                if pages is not None and n_resident > pages.read_bytes:
                     with disk_faults("write pages of", path):
                         tile = pages.keep(tile)
                 tiles[index] = tile

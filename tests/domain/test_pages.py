@@ -111,11 +111,66 @@ def test_the_coldest_parts_leave_memory_first(tmp_path: Path) -> None:
     ]
     assert [x for x in order if x in where][-1] == where[-1], "what was changed last leaves last"
     assert order.index(where[0]) < order.index(where[1]) < order.index(where[2])
-    before = sum(pages._resident.values())
+    before = sum(part.n_bytes for part in pages._resident.values())
     pages.max_resident_bytes = 1
     mapper.relieve(pages)
     assert pages._resident == {}
     assert before <= pages.file.n_bytes < 1.5 * before
+
+
+def test_what_scans_leave_alone_goes_to_pages_though_there_is_room(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def use(**values: int) -> None:
+        for name, value in values.items():
+            monkeypatch.setattr(f"potserver.domain.pages.{name}", value)
+
+    in_memory, mapper = (MappingService(settings=SETTINGS, threads=1) for _ in range(2))
+    pages = Pages(tmp_path, 10**9)
+
+    def drive(*places_m: float) -> set[float]:
+        """Those of three places that are in memory, the parts about their middle."""
+        for seq, x_m in enumerate(places_m):
+            for each in (in_memory, mapper):
+                each.integrate(scan_at(x_m, seq))
+            mapper.relieve(pages)
+        tiled = mapper.state.tiled
+        assert tiled is not None
+        middles = {part_of(tiled.grid.index_of(np.array([x, 0.0, 0.0]))): x for x in (0.0, 120.0, 240.0)}
+        return {middles[number] for number in pages._resident if number in middles}
+
+    use(_COLD_SCANS=20, _SMALL_BYTES=1, _AT_ONCE=1)
+    assert drive(0.0, 120.0, 240.0) == {0.0, 120.0, 240.0}, "scans were there just now"
+    assert drive(*[0.0] * 40) == {0.0}
+    assert drive(240.0) == {0.0, 240.0}
+    assert bytes_of(mapper.state.tiled) == bytes_of(in_memory.state.tiled)
+    for there_is_little in ({"_AT_ONCE": 10**9}, {"_SMALL_BYTES": 10**9}):
+        use(_COLD_SCANS=0, _AT_ONCE=1, _SMALL_BYTES=1)
+        use(**there_is_little)
+        assert drive(0.0, 120.0) == {0.0, 120.0, 240.0}
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="/proc tells it")
+def test_what_was_read_leaves_memory_and_comes_back(tmp_path: Path) -> None:
+    def in_memory() -> int:
+        fields, of_file = [], False
+        for line in Path("/proc/self/smaps").read_text().splitlines():
+            if "-" in line.split()[0]:
+                of_file = str(tmp_path) in line
+            elif of_file and line.startswith("Rss:"):
+                fields.append(int(line.split()[1]))
+        return sum(fields)
+
+    file = PageFile(tmp_path)
+    array = np.random.default_rng(0).normal(size=200_000)
+    kept = next(iter(file.put([array]).values()))
+    assert in_memory() == 0, "nobody has read it"
+    for _ in range(2):
+        np.testing.assert_array_equal(kept, array)
+        assert in_memory() > 1000
+        file.let_go()
+        assert in_memory() == 0
+    file.check()
 
 
 def test_what_the_disk_does_not_read_back_is_told(tmp_path: Path) -> None:
