@@ -70,6 +70,9 @@ class AtomSettings:
     """Changes of the atom dictionary over `ctl/atoms`."""
 
     writable: Annotated[bool, "whoever may ask `ctl/atoms` or `ctl/learn` may change the dictionary"] = False
+    propose: Annotated[
+        bool, "where `writable`, learn by itself from a map whose scans are new to the dictionary"
+    ] = False
     save: Annotated[bool, "write each change to the file `dictionary`; else a restart forgets it"] = False
 
 

@@ -3,14 +3,15 @@
     with MapServer(Settings(), listen="tcp/127.0.0.1:0") as server:
         client = MapClient(server.endpoint)
 
-Threads, besides Zenoh's own and those of `MapNode`: the query workers, the stats publisher and its queryable, one a
-store for snapshots, and, with `web.listen`, those of HTTP.
+Threads, besides Zenoh's own and those of `MapNode`: the query workers, one that learns what is new, the stats publisher and
+its queryable, one a store for snapshots, and, with `web.listen`, those of HTTP.
 """
 
 from __future__ import annotations
 
 import atexit
 import dataclasses
+import functools
 import threading
 import time
 from collections.abc import Callable
@@ -22,6 +23,7 @@ import zenoh
 from potclient.client import MapClient
 from potschemas import __version__, keys, messages
 from potserver.adapters.presence import OtherServers, SessionWatch
+from potserver.adapters.proposer import Proposer
 from potserver.adapters.query_pool import QueryPool
 from potserver.adapters.session import (
     build_config,
@@ -83,6 +85,7 @@ class MapServer:
         self._endpoints: list[str] = []
         self.nodes: dict[str, MapNode] = {}  # by map id; to look at
         self.pool: QueryPool | None = None
+        self._proposer = Proposer(self.health)
         self._stats: StatsPublisher | None = None
         self._sessions: SessionWatch | None = None
         self._helper: Helper | None = None  # compiles beside us
@@ -205,7 +208,7 @@ class MapServer:
         mappers = [self._make_map(map_id) for map_id in s.maps]
         if s.atoms.writable and not s.store.read_only:
             for mapper in mappers:
-                mapper.keep_looks()
+                mapper.keep_looks(self._proposals_of(mapper))
         config = build_config(s.zenoh, root=s.root, wire_guard_bytes=s.limits.wire_guard_bytes)
         self._max_sessions = raise_file_limit(max_sessions_of(config))
         try:
@@ -243,7 +246,9 @@ class MapServer:
             max_rate_hz=s.queries.max_rate_hz,
         )
         self._sessions = SessionWatch(session, self.pool.give_up, self._max_sessions)
-        shared = Shared(s, session, self.pool, _atom_store(mappers, s), self.health)
+        atoms = _atom_store(mappers, s)
+        self._proposer.start(atoms)
+        shared = Shared(s, session, self.pool, atoms, self.health)
         for mapper, numbers in zip(mappers, heard, strict=True):
             keeper = self._stores.get(mapper.map_id, MemoryOnly())
             self.nodes[mapper.map_id] = MapNode(mapper, keeper, numbers, shared)
@@ -253,6 +258,9 @@ class MapServer:
         if s.ros.clouds:
             client = MapClient(map=s.ros.map or s.maps[0], root=s.root, session=session)
             self._ros = Bridge(session, client, s.ros, self.health), client
+
+    def _proposals_of(self, mapper: MappingService) -> Callable[[], None] | None:
+        return functools.partial(self._proposer.propose, mapper) if self.settings.atoms.propose else None
 
     def _open_store(self, mapper: MappingService) -> Heard:
         """Give a map what was kept of it; the last numbers of its robots."""
@@ -329,6 +337,7 @@ class MapServer:
             if part is not None:
                 part.close()
         ended = [node.close() for node in nodes]
+        ended.append(self._proposer.close(FLUSH_S))
         kept = self._close_stores()  # after the writers: a last snapshot of what they made
         clean = all(
             [ros_ended, *drained, answered, *ended, kept, close_session(session, _CLOSE_S), self._close_web()]

@@ -28,16 +28,17 @@ class Looks:
         """Each robot's together, in order."""
         return tuple(sorted(self._kept, key=lambda scan: scan.robot_id))
 
-    def take(self, scan: Scan) -> None:
-        """A scan comes."""
+    def take(self, scan: Scan) -> bool:
+        """A scan comes; whether it is kept."""
         if scan.is_planar or any(
             np.linalg.norm(scan.origin - kept.origin) < self._gap_m for kept in self._kept
         ):
-            return
+            return False
         kept = (*self._kept, _thinned(scan, len(self._kept)))
         if len(kept) > MOST_LOOKS:
             kept, self._gap_m = kept[::2], 2.0 * self._gap_m
         self._kept = kept
+        return True
 
     def forget(self, robot_id: str) -> None:
         """What one robot saw is not learned from."""

@@ -367,6 +367,7 @@ class MapUpdate:
     changed: TileChange
     timings_ms: dict[str, float]  # per stage of the pipeline
     leans_on: str | None = None  # what in the dictionary is expected about this scan
+    foretold: float | None = None  # how well that foretells the scan's own beams, in (0, 1]
     not_leaning: str | None = (
         None  # why the map leans on nothing about this scan; none: it does, nobody asked, or never would
     )

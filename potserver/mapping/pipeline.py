@@ -241,6 +241,7 @@ def integrated(
         changed=TileChange(after.tiled.grid.size_m, sorted(fused.tiles)),
         timings_ms=timings_ms,
         leans_on=None if expected is None or expected.place is None else expected.place.name,
+        foretold=None if expected is None or expected.place is None else expected.place.scale,
         not_leaning=None if expected is None else expected.reason,
     )
     return Integrated(dataclasses.replace(after, epoch=before.epoch, n_scans=before.n_scans + 1), update)

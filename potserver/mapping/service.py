@@ -21,6 +21,7 @@ from potserver.errors import SettingsError, UnknownRobotError
 from potserver.mapping import edits
 from potserver.mapping.default import DefaultPipeline
 from potserver.mapping.fusion import Moment
+from potserver.mapping.novelty import Novelty
 from potserver.mapping.paper import PAPER, PotPipeline
 from potserver.mapping.pipeline import Method, Pipeline
 from potserver.mapping.settings import MappingSettings
@@ -82,6 +83,7 @@ class MappingService:
         self.settings = settings or MappingSettings()
         self.atom_usage: Counter[str] = Counter()
         self._looks: Looks | None = None
+        self._novelty: Novelty | None = None
         self._threads = threads or default_threads()
         self._make_pipeline = make_pipeline
         self._pipeline = make_pipeline(self.settings, threads=self._threads, seed=seed)
@@ -138,14 +140,20 @@ class MappingService:
         self.atom_usage.update(match.atom_id for match in update.sectors if match.atom_id is not None)
         if update.leans_on is not None:
             self.atom_usage[update.leans_on] += 1
-        if self._looks is not None:
-            self._looks.take(scan)
+        is_kept = self._looks is not None and self._looks.take(scan)
         self.state = state
+        if is_kept and self._novelty is not None:
+            self._novelty.note(update)
         return update
 
-    def keep_looks(self) -> None:
-        """From now on keep some of the scans, up to 25 MB, for the dictionary to learn from."""
+    def keep_looks(self, on_novelty: Callable[[], None] | None = None) -> None:
+        """From now on keep some of the scans, up to 25 MB, for the dictionary to learn from.
+
+        Args:
+            on_novelty: Called when so many of them were new that learning is worth while, see `Novelty`; it must not wait.
+        """
         self._looks = Looks()
+        self._novelty = None if on_novelty is None else Novelty(on_novelty)
 
     @property
     def learned_from(self) -> tuple[Scan, ...]:
@@ -283,7 +291,7 @@ class MappingService:
         if commit is not None:
             commit(state)
         if self._looks is not None:
-            self.keep_looks()
+            self._looks = Looks()
         tiles = {index for s in (self.state, state) if s.tiled is not None for index in s.tiled.tiles}
         self.state = state
         return TileChange(self.settings.tile_size_m, sorted(tiles))

@@ -16,7 +16,10 @@ from potclient import Atom, AtomRefusedError, MapClient, ReadOnlyError, UnknownA
 from potclient.errors import InternalError, MapServerError, ShapeError
 from potserver.config import load_settings
 from potserver.domain.dictionary import AtomDictionary
+from potserver.mapping.novelty import FIRST
 from potserver.server import MapServer
+
+from .conftest import until
 
 FAST = {"mapping.max_range_m": 15.0, "mapping.beams_per_scan": 600, "threads": 1, "atoms.writable": True}
 ORIGIN = np.eye(4)
@@ -300,6 +303,36 @@ def test_a_server_learns_the_place_that_it_maps(serve: Serve, site: Path) -> Non
     with pytest.raises(AtomRefusedError, match="too few"):
         client.learn("yard")
     client.remove_atom("yard")
+    assert client.places() == []
+
+
+def test_what_is_new_is_learned_without_being_asked(serve: Serve, site: Path) -> None:
+    """A dictionary of atoms alone expects nothing, so that every scan is new to it."""
+    client = serve(dictionary=str(site), atoms__propose=True, map_id="default")
+    for number in range(FIRST):
+        client.integrate(*street(0.8 * number), stamp_ns=number + 1)
+    until(lambda: client.stats().counters.get("atoms.learned") == 1, "what is new")
+    assert client.stats().counters["atoms.proposed"] == 1
+    (place,) = client.places()
+    assert (place.name, place.provenance["scans"]) == ("default-1", str(FIRST))
+    client.integrate(*street(40.0), stamp_ns=99)
+    assert client.places()[0].times_used == 1
+    for number in range(2 * FIRST):  # known now: nothing more is proposed
+        client.integrate(*street(60.0 + 0.8 * number), stamp_ns=100 + number)
+    assert client.stats().counters["atoms.proposed"] == 1
+    assert not AtomDictionary.load(site).grown, "changes stay in memory unless the operator says otherwise"
+
+
+def test_a_proposal_that_teaches_nothing_is_refused_and_counted(serve: Serve, site: Path) -> None:
+    client = serve(dictionary=str(site), atoms__propose=True)
+    up = np.float32([[0, 0, 3.0]])
+    for number in range(FIRST):  # no ground below the sensor
+        points, pose = street(0.8 * number)
+        client.integrate(np.abs(points) + up, pose, stamp_ns=number + 1)
+    until(lambda: client.stats().counters.get("atoms.refused.too_few_scans") == 1, "the refusal")
+    counters = client.stats().counters
+    assert counters["atoms.proposed"] == 1
+    assert "atoms.learned" not in counters
     assert client.places() == []
 
 
