@@ -21,9 +21,9 @@ from potserver.domain.types import Bool, Float32, Float64, Scan
 from potserver.numerics.abhm.dispersions import one_torch_thread
 from potserver.numerics.beams import Beams, cut_range, label_beams, limit_range
 from potserver.numerics.ground import LEAST_GROUND, LOWEST_EYE_M, Ground, ground_of
-from potserver.numerics.surroundings import N_FEATURES, Perceptron, Surroundings
+from potserver.numerics.surroundings import FORMER_FEATURES, N_FEATURES, Perceptron, Surroundings
 
-_SHARES = (1, 4, 4, 16, 64, 256, 256, 1024)  # one beam of so many is seen
+_SHARES = (1, 4, 4, 16, 64, 256, 256, 1024, 1024)  # one beam of so many is seen
 _RINGS = (4, 8, 16, 32)  # or so many rings
 _RING_RAD = np.radians(0.2)  # beams whose elevations round to the same multiple belong to one
 _SEEN = 30_000  # beams, at most
@@ -36,6 +36,7 @@ _WIDTHS = (48, 32)
 _DIGITS = 4  # kept of a weight behind the point
 _EPOCHS, _BATCH, _LEARNING_RATE = 12, 1024, 0.01
 _EPOCHS_OF_MORE, _RATE_OF_MORE = 5, 0.003  # of a net that goes on
+_WITHOUT_LINES = 0.4  # of the places: real ones stand less in lines than made-up streets
 _CORNERS = np.array(list(itertools.product((0, 1), repeat=3)))
 
 
@@ -193,10 +194,9 @@ def _lesson(view: Surroundings, points: Float64, occupied: Bool, rng: np.random.
     along = placed - corner
     nodes = (corner[:, None] + _CORNERS - shift) * spacing @ to_lattice
     shares = np.where(_CORNERS == 1, along[:, None], 1 - along[:, None]).prod(axis=2)
-    features = view.features(np.ascontiguousarray(nodes.reshape(-1, 3)))
-    return _Lesson(
-        features.reshape(-1, 8, N_FEATURES).astype(np.float16), shares.astype(np.float32), occupied
-    )
+    features = view.features(np.ascontiguousarray(nodes.reshape(-1, 3))).reshape(-1, 8, N_FEATURES)
+    features[rng.random(len(points)) < _WITHOUT_LINES, :, FORMER_FEATURES:] = 0.0
+    return _Lesson(features.astype(np.float16), shares.astype(np.float32), occupied)
 
 
 def _fit(lesson: _Lesson, seed: int, start: Perceptron | None = None) -> Perceptron:

@@ -32,7 +32,7 @@ from safetensors.numpy import save as to_safetensors
 from potserver.domain.folders import sync_folder
 from potserver.domain.types import KERNEL_ARRAYS, Atom, KernelSet
 from potserver.errors import BadPointsError, DictionaryError, EmptyError, ShapeError
-from potserver.numerics.surroundings import Perceptron
+from potserver.numerics.surroundings import FORMER_FEATURES, N_FEATURES, Perceptron
 
 VERSION = 2
 _METADATA_KEY = "potserver-atoms"  # one key: safetensors keeps no order between several
@@ -268,6 +268,8 @@ def _parse_net(path: Path, told: object) -> Perceptron:
     try:
         layers = cast("dict[str, Any]", told).items()
         net = Perceptron(**{name: np.array(values, np.float32) for name, values in layers})
+        if len(net.first) == FORMER_FEATURES:  # it knows no lines
+            net = net._replace(first=np.pad(net.first, ((0, N_FEATURES - FORMER_FEATURES), (0, 0))))
         sound = net.is_sound
     except (TypeError, ValueError, AttributeError):
         sound = False

@@ -5,6 +5,9 @@ Two grids about the sensor hold a scan. *Directions* (azimuth x elevation) keep 
 every cell it is known which filled cells lie nearest in its four quarters (up or farther, down or nearer, left, right). So a
 place has five beams and five columns beside it, its own and four neighbours, however dense the scan is; they and its height
 above the ground are the place's features. All are measured along the bearing, so that turning the scene changes nothing.
+
+Where beams are few a place's neighbours are far from it, and the scan as a whole tells more: along which *lines* its columns
+stand (the fronts of a street), how many of them are nearer than a place and how many as far, and how many beams there are.
 """
 
 from __future__ import annotations
@@ -26,14 +29,31 @@ _STANDS_M = 0.3  # above the ground
 _SIDEWAYS_RAD = 1.6  # neighbours to the left and right are at most so far
 _NEAREST_M = 0.5  # of range: nearer columns are as wide as there
 _SIDES = 5  # the own cell and four quarters
-_OF_PLACE, _OF_BEAM, _OF_COLUMN = 5, 5, 4  # features
-N_FEATURES = _OF_PLACE + _SIDES * (_OF_BEAM + _OF_COLUMN)
+_OF_PLACE, _OF_BEAM, _OF_COLUMN, _OF_LINES, _BETWEEN = 5, 5, 4, 11, 4  # features
+FORMER_FEATURES = _OF_PLACE + _SIDES * (_OF_BEAM + _OF_COLUMN)  # of nets that knew no lines
+N_FEATURES = FORMER_FEATURES + _OF_LINES + _BETWEEN
+_TURNS, _STRIPS, _STRIP_M = 45, 64, 0.5  # of a quarter turn; of the distance from a line through the sensor
+_SEARCHED = 500  # columns tell the direction
+_FEW, _SOME = 3.0, 8.0  # columns: of fewer on a side their places say little
+_APART_RAD = 1.6  # neighbours with more between them have no line in common
 _NONE_M = -1.0  # range of an empty cell
 _AT_ONCE = 128  # places: their features stay in the processor's cache
 _QUICK = {"nnan", "ninf", "nsz", "arcp", "contract", "afn"}  # no `reassoc`: sums keep their order
 _FEET_M, _ROOM_M, _FAR_M = 0.2, 0.5, 5.0  # scales at which lengths are told apart
 # Where no beam came near, nothing is called sure: a beam is near that passes so far beside, or ends so far before.
 _BESIDE_M, _BEFORE_M, _UNSEEN_LOG_ODDS = 1.5, 1.2, 2.0
+
+
+class Lines(NamedTuple):
+    """Along what a scan's columns stand: in the first direction they lie in the fewest strips, the second is across."""
+
+    scene: Float32  # (4,) cosine and sine of the first; how many columns, how many beams, in [0, 1] about
+    strips: (
+        Float32  # (2, 2, strips, 2) by direction, side and distance: the shares of columns nearer, and there
+    )
+    sides: (
+        Float32  # (2, 2, 2) the distance that half of the columns are within, m; how many they are, in [0, 1)
+    )
 
 
 class Surroundings(NamedTuple):
@@ -46,6 +66,7 @@ class Surroundings(NamedTuple):
     )
     by_beams: Int32  # (4, azimuths x elevations) the nearest filled cell in each quarter; -1: none
     by_columns: Int32  # (4, azimuths x ranges)
+    lines: Lines
 
     @staticmethod
     def of(beams: Beams, ground: Ground) -> Surroundings:
@@ -53,7 +74,8 @@ class Surroundings(NamedTuple):
         heights = ground.below(beams.ends)
         found, columns = _enter(beams.ends, beams.is_return, heights)
         by_beams = _nearest(found, _ELEVATIONS, True)
-        return Surroundings(ground, found, columns, by_beams, _nearest(columns, _RANGES, False))
+        lines = Lines(*_lines_of(columns, len(beams.ends)))
+        return Surroundings(ground, found, columns, by_beams, _nearest(columns, _RANGES, False), lines)
 
     def features(self, points: Float64) -> Float32:
         """(N, N_FEATURES) about (N, 3) places, m; each in [-1, 1.5]."""
@@ -134,6 +156,62 @@ def _enter(ends, is_return, height):
 
 
 @nb.njit(nogil=True, error_model="numpy", cache=True)
+def _in_strips(x, y, cos, sin):
+    """(2, 2, strips) how many places lie at which distance, on either side of the two directions."""
+    out = np.zeros((2, 2, _STRIPS))
+    for i in range(len(x)):
+        beside, along = cos * y[i] - sin * x[i], cos * x[i] + sin * y[i]
+        out[0, np.int64(beside > 0), _cell(abs(beside) / _STRIP_M, _STRIPS)] += 1
+        out[1, np.int64(along > 0), _cell(abs(along) / _STRIP_M, _STRIPS)] += 1
+    return out
+
+
+@nb.njit(nogil=True, error_model="numpy", cache=True)
+def _crowded(strips):
+    """How much falls into the same strip or the next."""
+    total = 0.0
+    for side in range(2):
+        row = strips[side]
+        for b in range(_STRIPS):
+            total += row[b] * (row[b] + 2.0 * (row[b - 1] if b else 0.0))
+    return total
+
+
+@nb.njit(nogil=True, error_model="numpy", cache=True)
+def _lines_of(columns, n_beams):
+    """What `Lines` holds."""
+    stands = columns[:, 1] >= 0
+    x, y = columns[stands, 1] * np.cos(columns[stands, 0]), columns[stands, 1] * np.sin(columns[stands, 0])
+    n, best, most = len(x), 0.0, -1.0
+    step = 1 + n // _SEARCHED
+    for turn in range(2 * _TURNS):
+        angle = turn * (np.pi / 2 / _TURNS)
+        crowded = _crowded(_in_strips(x[::step], y[::step], np.cos(angle), np.sin(angle))[0])
+        if crowded > most:
+            best, most = angle, crowded
+    scene = np.array(
+        [np.cos(best), np.sin(best), np.log(n + 1.0) / 8.0, np.log(max(n_beams, 1)) / 12.0], np.float32
+    )
+    counts = _in_strips(x, y, scene[0], scene[1])
+    strips, sides = np.zeros((2, 2, _STRIPS, 2), np.float32), np.zeros((2, 2, 2), np.float32)
+    for d in range(2):
+        for side in range(2):
+            row, nearer = counts[d, side], 0.0
+            total, half = row.sum(), _STRIPS * _STRIP_M
+            for b in range(_STRIPS):
+                about = row[max(b - 1, 0) : b + 2].sum()
+                strips[d, side, b, 0], strips[d, side, b, 1] = (
+                    (nearer + 0.5 * row[b]) / max(total, 1.0),
+                    about / (total + _FEW),
+                )
+                if nearer <= 0.5 * total < nearer + row[b]:
+                    half = (b + 0.5) * _STRIP_M
+                nearer += row[b]
+            sides[d, side, 0], sides[d, side, 1] = half, total / (total + _SOME)
+    return scene, strips, sides
+
+
+@nb.njit(nogil=True, error_model="numpy", cache=True)
 def _is_filled(cells, c, are_beams):
     return cells[c, 2 if are_beams else 1] >= 0
 
@@ -186,7 +264,7 @@ def _of(x, scale):
 
 
 @nb.njit(nogil=True, fastmath=_QUICK, error_model="numpy", cache=True)
-def _features_at(point, h, beams, columns, by_beams, by_columns, f):
+def _features_at(point, h, beams, columns, by_beams, by_columns, lines, f):
     """Fill in the features; whether a beam came near."""
     x, y, z = point
     across = np.hypot(x, y)
@@ -219,13 +297,51 @@ def _features_at(point, h, beams, columns, by_beams, by_columns, f):
         else:
             f[n], f[n + 1], f[n + 2], f[n + 3] = 1.0, 0.0, 0.0, 0.0
         n += _OF_COLUMN
+    _lines_at(x, y, across, lines, f, n)
+    n += _OF_LINES
+    _between(beams, by_beams[0, beam], by_beams[1, beam], 1, elevation, 2, length, f, n)
+    _between(columns, by_columns[2, column], by_columns[3, column], 0, azimuth, 1, across, f, n + 2)
     return is_near
 
 
 @nb.njit(nogil=True, fastmath=_QUICK, error_model="numpy", cache=True)
-def _features(points, height, beams, columns, by_beams, by_columns, out):
+def _lines_at(x, y, across, lines, f, n):
+    scene, strips, sides = lines
+    beside, along = scene[0] * y - scene[1] * x, scene[0] * x + scene[1] * y
+    f[n], f[n + 1], f[n + 2] = scene[2], scene[3], (along / max(across, np.float32(0.1))) ** 2
+    n += 3
+    for d in range(2):
+        off = along if d else beside
+        side = 1 if off > 0 else 0
+        off = abs(off)
+        at = off * (1.0 / _STRIP_M) - 0.5
+        b = _cell(at, _STRIPS - 1)
+        share = np.float32(min(max(at - b, 0.0), 1.0))
+        low, high = strips[d, side, b], strips[d, side, b + 1]
+        f[n], f[n + 1] = low[0] + share * (high[0] - low[0]), low[1] + share * (high[1] - low[1])
+        f[n + 2], f[n + 3] = _of(off - sides[d, side, 0], 1.0), sides[d, side, 1]
+        n += 4
+
+
+@nb.njit(nogil=True, fastmath=_QUICK, error_model="numpy", cache=True)
+def _between(cells, one, other, along, at, of, length, f, n):
+    """How much farther than a place the line from one neighbour to the other is, about, and how near these are."""
+    f[n], f[n + 1] = 0.0, 0.0
+    if one < 0 or other < 0:
+        return
+    p, q = _turned(cells[one, along] - at), _turned(cells[other, along] - at)
+    apart = abs(p - q)
+    if p * q >= 0 or apart > _APART_RAD:
+        return
+    a, b = max(cells[one, of], np.float32(_NEAREST_M)), max(cells[other, of], np.float32(_NEAREST_M))
+    away = a * b * apart / (a * abs(p) + b * abs(q))
+    f[n], f[n + 1] = _of(away - length, 1.0), 1.0 / (1.0 + 4.0 * apart)
+
+
+@nb.njit(nogil=True, fastmath=_QUICK, error_model="numpy", cache=True)
+def _features(points, height, beams, columns, by_beams, by_columns, lines, out):
     for p in range(len(points)):
-        _features_at(points[p], height[p], beams, columns, by_beams, by_columns, out[p])
+        _features_at(points[p], height[p], beams, columns, by_beams, by_columns, lines, out[p])
 
 
 # In a layer the places are the inner loop: BLAS would wake all processors for products as small as these.
@@ -261,7 +377,7 @@ def _layer(x, weights, bias, out):
 
 
 @nb.njit(nogil=True, error_model="numpy", cache=True)
-def _expected(points, height, beams, columns, by_beams, by_columns, w1, b1, w2, b2, w3, b3, out):
+def _expected(points, height, beams, columns, by_beams, by_columns, lines, w1, b1, w2, b2, w3, b3, out):
     f, x = np.empty(N_FEATURES, np.float32), np.zeros((N_FEATURES, _AT_ONCE), np.float32)
     one, two = np.empty((len(b1), _AT_ONCE), np.float32), np.empty((len(b2), _AT_ONCE), np.float32)
     most = np.empty(_AT_ONCE)
@@ -269,7 +385,7 @@ def _expected(points, height, beams, columns, by_beams, by_columns, w1, b1, w2, 
         n = min(_AT_ONCE, len(points) - start)
         for p in range(n):
             is_near = _features_at(
-                points[start + p], height[start + p], beams, columns, by_beams, by_columns, f
+                points[start + p], height[start + p], beams, columns, by_beams, by_columns, lines, f
             )
             most[p] = np.inf if is_near else _UNSEEN_LOG_ODDS
             for i in range(N_FEATURES):

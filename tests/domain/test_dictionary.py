@@ -18,7 +18,7 @@ from potserver.domain import atom_file
 from potserver.domain.dictionary import AtomDictionary
 from potserver.domain.types import Atom, KernelSet
 from potserver.errors import DictionaryError, UnknownAtomError
-from potserver.numerics.surroundings import N_FEATURES, Perceptron
+from potserver.numerics.surroundings import FORMER_FEATURES, N_FEATURES, Perceptron
 
 _KERNEL_ARRAYS = [f.name for f in dataclasses.fields(KernelSet)]
 
@@ -120,6 +120,19 @@ def test_an_expectation_is_kept_through_files_and_changes(atoms: AtomDictionary,
     AtomDictionary(atoms, expectation=net._replace(first=net.first[1:])).save(tmp_path / "b.atoms")
     with pytest.raises(DictionaryError, match="expectation"):
         AtomDictionary.load(tmp_path / "b.atoms")
+
+
+def test_a_net_of_before_that_knows_no_lines_says_what_it_said(tmp_path: Path) -> None:
+    now = AtomDictionary.builtin().expectation
+    assert now is not None
+    former = now._replace(first=now.first[:FORMER_FEATURES])
+    path = tmp_path / "former.atoms"
+    AtomDictionary(expectation=former).save(path)
+    read = AtomDictionary.load(path).expectation
+    assert read is not None
+    assert read.is_sound
+    np.testing.assert_array_equal(read.first[:FORMER_FEATURES], former.first)
+    assert not read.first[FORMER_FEATURES:].any()
 
 
 def test_no_atoms_are_a_file_too(tmp_path: Path) -> None:

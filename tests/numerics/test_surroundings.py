@@ -10,7 +10,14 @@ from potserver.numerics.ground import Ground
 from potserver.numerics.surroundings import N_FEATURES, Perceptron, Surroundings
 
 FLOOR = Ground(-1.5, 0.0, 0.0, 100)
-OWN_BEAM, UP_BEAM, OWN_COLUMN, FARTHER_COLUMN = 5, 10, 30, 34  # where their features begin
+OWN_BEAM, UP_BEAM, OWN_COLUMN, FARTHER_COLUMN, LINES, BETWEEN = (
+    5,
+    10,
+    30,
+    34,
+    50,
+    61,
+)  # where their features begin
 
 
 def scene(rng: np.random.Generator, n: int = 400) -> Beams:
@@ -37,6 +44,36 @@ def test_a_place_knows_the_beam_through_it_and_what_stands_there() -> None:
     assert at[OWN_COLUMN + 2] == pytest.approx(2.0 / 3.0, abs=1e-3)  # 2 m above the ground, of 1 m
     assert before[FARTHER_COLUMN + 1] == pytest.approx(0.8, abs=0.01)  # 2 m away, of half a metre
     assert behind[FARTHER_COLUMN + 1] == 0.0  # nothing beyond
+
+
+def test_a_place_knows_on_which_side_of_a_front_it_is() -> None:
+    """Fronts 6 m to the left and 4 m to the right of a street that runs along 30 degrees, seen at few places."""
+    rng = np.random.default_rng(3)
+    along, left = rng.uniform(-20, 20, 60), np.arange(60) < 40
+    c, s = np.cos(np.radians(30.0)), np.sin(np.radians(30.0))
+    turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+    ends = np.column_stack([along, np.where(left, 6.2, -4.2), np.full(60, 0.5)]) @ turn.T
+    view = Surroundings.of(Beams(ends, np.ones(60, bool)), FLOOR)
+    told = view.features(np.array([[3.0, y, 0.0] for y in (3.0, 6.2, 9.0, -2.0, -8.0)]) @ turn.T)
+    nearer, there, to_half = told[:, LINES + 3], told[:, LINES + 4], told[:, LINES + 5]
+    np.testing.assert_allclose(nearer, [0.0, 0.5, 1.0, 0.0, 1.0], atol=0.25)
+    assert there[1] > 0.6
+    np.testing.assert_allclose(there[[0, 2, 3, 4]], 0.0, atol=0.05)
+    assert (np.sign(to_half[[0, 2, 3, 4]]) == [-1, 1, -1, 1]).all()
+    assert 0.85 > told[0, LINES + 6] > told[4, LINES + 6] > 0.6  # more was hit to the left
+
+
+def test_a_place_knows_the_line_between_its_neighbours() -> None:
+    """A wall 10 m ahead, of which two places were hit."""
+    ends = np.array([[10.0, -3.0, 0.5], [10.0, 3.0, 0.5]])
+    view = Surroundings.of(Beams(ends, np.ones(2, bool)), FLOOR)
+    before, on, behind, beside = view.features(
+        np.array([[8.0, 0.1, 0.4], [10.0, 0.1, 0.5], [12.0, 0.1, 0.6], [8.0, 6.0, 0.5]])
+    )
+    assert before[BETWEEN + 2] > 0.6 > 0.35 > abs(on[BETWEEN + 2])
+    assert behind[BETWEEN + 2] < -0.6
+    assert before[BETWEEN + 3] > 0.2
+    assert beside[BETWEEN + 3] == 0.0  # both on one side of it
 
 
 def test_turning_the_scene_by_cells_changes_nothing() -> None:
