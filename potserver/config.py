@@ -69,9 +69,9 @@ class PoseSettings:
 class AtomSettings:
     """Changes of the atom dictionary over `ctl/atoms`."""
 
-    writable: Annotated[bool, "whoever may ask `ctl/atoms` or `ctl/learn` may change the dictionary"] = False
-    propose: Annotated[
-        bool, "where `writable`, learn by itself from a map whose scans are new to the dictionary"
+    writable: Annotated[
+        bool,
+        "who may ask `ctl/atoms` or `ctl/learn` changes the dictionary, and the server learns what is new to it",
     ] = False
     save: Annotated[bool, "write each change to the file `dictionary`; else a restart forgets it"] = False
 

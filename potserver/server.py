@@ -208,7 +208,7 @@ class MapServer:
         mappers = [self._make_map(map_id) for map_id in s.maps]
         if s.atoms.writable and not s.store.read_only:
             for mapper in mappers:
-                mapper.keep_looks(self._proposals_of(mapper))
+                mapper.keep_looks(functools.partial(self._proposer.propose, mapper))
         config = build_config(s.zenoh, root=s.root, wire_guard_bytes=s.limits.wire_guard_bytes)
         self._max_sessions = raise_file_limit(max_sessions_of(config))
         try:
@@ -258,9 +258,6 @@ class MapServer:
         if s.ros.clouds:
             client = MapClient(map=s.ros.map or s.maps[0], root=s.root, session=session)
             self._ros = Bridge(session, client, s.ros, self.health), client
-
-    def _proposals_of(self, mapper: MappingService) -> Callable[[], None] | None:
-        return functools.partial(self._proposer.propose, mapper) if self.settings.atoms.propose else None
 
     def _open_store(self, mapper: MappingService) -> Heard:
         """Give a map what was kept of it; the last numbers of its robots."""

@@ -308,7 +308,7 @@ def test_a_server_learns_the_place_that_it_maps(serve: Serve, site: Path) -> Non
 
 def test_what_is_new_is_learned_without_being_asked(serve: Serve, site: Path) -> None:
     """A dictionary of atoms alone expects nothing, so that every scan is new to it."""
-    client = serve(dictionary=str(site), atoms__propose=True, map_id="default")
+    client = serve(dictionary=str(site))
     for number in range(FIRST):
         client.integrate(*street(0.8 * number), stamp_ns=number + 1)
     until(lambda: client.stats().counters.get("atoms.learned") == 1, "what is new")
@@ -324,7 +324,7 @@ def test_what_is_new_is_learned_without_being_asked(serve: Serve, site: Path) ->
 
 
 def test_a_proposal_that_teaches_nothing_is_refused_and_counted(serve: Serve, site: Path) -> None:
-    client = serve(dictionary=str(site), atoms__propose=True)
+    client = serve(dictionary=str(site))
     up = np.float32([[0, 0, 3.0]])
     for number in range(FIRST):  # no ground below the sensor
         points, pose = street(0.8 * number)
