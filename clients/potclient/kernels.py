@@ -160,9 +160,9 @@ class KernelSet:
                         f"{path}: kernel file of version {version}, this client reads {_FILE_VERSION}"
                     )
                 return cls(
-                    # early files have no `mean_moderation`: its default is theirs
+                    # early files lack the last ones: their defaults are theirs
                     rule=AnswerRule(
-                        **{n: stored[n] for n in RULE_FIELDS if n != "mean_moderation" or n in stored}
+                        **{n: stored[n] for n in RULE_FIELDS if n not in _LATER_RULE or n in stored}
                     ),
                     map_revision=int(stored["map_revision"]),
                     lean=_stored_lean(stored),
@@ -223,6 +223,7 @@ class KernelSet:
         return dataclasses.replace(parts[0], **arrays, lean=lean)
 
 
+_LATER_RULE = ("mean_moderation", "full_activation")  # of the rule, not in early files
 _ARRAYS = ("hinge_mean", "hinge_var", "gamma_shape", "gamma_rate", "weight_mean", "weight_var")
 
 

@@ -83,6 +83,11 @@ class MapPart:
         )
 
     @property
+    def is_planar(self) -> bool:
+        """Whether all kernels stand on lattices in planes."""
+        return not len(self.rest) and all(found.lattice.plane is not None for found in self.bricks)
+
+    @property
     def kernels(self) -> KernelSet:
         """All kernels, map frame; put together anew each time."""
         return KernelSet.concatenate([kernels.moved(shift) for kernels, shift in self.members])

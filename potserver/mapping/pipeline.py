@@ -40,9 +40,12 @@ from potserver.mapping.surfaces import FACE_SAMPLES, FaceSamples
 from potserver.mapping.transport import CouplingOptions
 from potserver.numerics.beams import LabelledPoints, label_beams
 
-# A full lattice of known kernels sums to an activation of 3.4 (in 2D 2.3), half of it to about half: what has less lies beyond
-# the data. `mean_moderation` of a twentieth: variances are of single weights, and all of them would make the map timid.
-DEFAULT_RULE = AnswerRule(observed_activation=1.4, residual_var=50.0, mean_moderation=0.05)
+_FULL, _FULL_IN_PLANE = 3.4, 2.3  # activation that a full lattice of known kernels sums to
+# Half of a lattice sums to about half of it: what has less lies beyond the data. `mean_moderation` of a twentieth: variances are
+# of single weights, and all of them would make the map timid.
+DEFAULT_RULE = AnswerRule(
+    observed_activation=1.4, residual_var=50.0, mean_moderation=0.05, full_activation=_FULL
+)
 
 
 class Method(NamedTuple):
@@ -143,10 +146,12 @@ class Pipeline(ABC):
 
     def snapshot(self, tiled: TiledMap | None, revision: int, scores: RunningScores) -> KernelMap:
         """What a map answers from, by what its self-check has found so far."""
+        parts = list(tiled.parts.values()) if tiled is not None else []
         rule = self.method.rule
         if self.method.is_calibrated:
             rule = dataclasses.replace(rule, mean_moderation=scores.moderation(rule.mean_moderation))
-        parts = list(tiled.parts.values()) if tiled is not None else []
+        if rule.full_activation and parts and all(part.is_planar for part in parts):
+            rule = in_plane(rule)
         lean = None if tiled is None else tiled.lean
         return KernelMap(parts, rule=rule, map_revision=revision, threads=self.threads, lean=lean)
 
@@ -247,6 +252,17 @@ def integrated(
     return Integrated(dataclasses.replace(after, epoch=before.epoch, n_scans=before.n_scans + 1), update)
 
 
+def in_plane(rule: AnswerRule) -> AnswerRule:
+    """The rule of a map whose kernels all stand in planes: lattices sum to less there."""
+    return dataclasses.replace(
+        rule,
+        observed_activation=rule.observed_activation * _FULL_IN_PLANE / _FULL,
+        full_activation=rule.full_activation * _FULL_IN_PLANE / _FULL,
+    )
+
+
 def rule_of(own: OwnMap, rule: AnswerRule) -> AnswerRule:
     """What turns a scan's own map into answers. Carried kernels are few and wide: where one is known, so is the place."""
-    return rule if own.spacings_m else dataclasses.replace(rule, observed_activation=OBSERVED_ACTIVATION)
+    if own.spacings_m:
+        return rule
+    return dataclasses.replace(rule, observed_activation=OBSERVED_ACTIVATION, full_activation=0.0)

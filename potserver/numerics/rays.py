@@ -21,7 +21,16 @@ from typing import NamedTuple
 import numba as nb
 import numpy as np
 
-from potschemas.answers import ROOM, ROOM_IN_SOLID, AnswerRule
+from potschemas.answers import (
+    FREE_FROM,
+    FREE_GAIN,
+    OCCUPIED_FROM,
+    OCCUPIED_GAIN,
+    ROOM,
+    ROOM_IN_SOLID,
+    SURE,
+    AnswerRule,
+)
 from potserver.numerics.arrays import Float64, Int64
 from potserver.numerics.brick_map import BrickMap, BrickTable
 from potserver.numerics.brick_sums import room_for_a_thread, sums_at
@@ -157,6 +166,7 @@ def first_returns(
         observed_activation=float(rule.observed_activation),
         residual_var=float(rule.residual_var),
         mean_moderation=float(rule.mean_moderation),
+        full_activation=float(rule.full_activation),
         evidence_only=options.evidence_only,
         lean=(lean or Lean(1.0, {})).table,
     )
@@ -179,6 +189,7 @@ class _March(NamedTuple):
     observed_activation: float
     residual_var: float  # log-odds^2
     mean_moderation: float
+    full_activation: float
     evidence_only: bool
     lean: LeanTable
 
@@ -190,6 +201,17 @@ def moderated(
     """z of the occupancy sigmoid(z) of sums at an observed point, without a lean: `potschemas.answers`, for one point."""
     s2 = var + residual_var * max(1.0 - activation, 0.0)
     return mean / math.sqrt(1.0 + mean_moderation * math.pi / 8.0 * s2)
+
+
+@nb.njit(error_model="numpy", cache=True)
+def ended(z: float, activation: float, full_activation: float, lean: float) -> float:
+    """z of an observed point where log-odds end, if they do: `potschemas.answers`, for one point; `lean` may be NaN."""
+    if full_activation == 0.0:
+        return z
+    density = activation / full_activation
+    if not math.isnan(lean):
+        z = max(z, min(lean, -(SURE + FREE_GAIN * max(density - FREE_FROM, 0.0))))
+    return min(z, SURE + OCCUPIED_GAIN * max(density - OCCUPIED_FROM, 0.0))
 
 
 @nb.njit(error_model="numpy", cache=True)
@@ -315,6 +337,7 @@ def _march(first, last, rays, n_steps, block, march, index, widths, room, out, q
                         full = ROOM + (ROOM_IN_SOLID - ROOM) * solid
                         borrowed = 1.0 - min((activation - march.observed_activation) / full, 1.0)
                     z = lean + (1.0 - borrowed) * z
+                z = ended(z, activation, march.full_activation, lean)
                 rate = _softplus(z) / width
             else:
                 is_known = False

@@ -20,7 +20,7 @@ import msgspec
 import numpy as np
 
 from potschemas import __version__
-from potschemas.answers import AnswerRule
+from potschemas.answers import RULE_FIELDS, AnswerRule
 from potserver.domain.folders import sync_folder
 from potserver.domain.kernel_map import KernelMap
 from potserver.domain.map_state import MapState
@@ -56,6 +56,7 @@ KIND = Kind(
 )
 _AT_ONCE = 256  # tiles that are read before they are decoded: some ten megabytes
 _SUM_LIMIT = 1 << 8 * SEAL_BYTES
+_FIRST_RULE = 4  # numbers that a rule had at first
 
 
 class MapRecord(msgspec.Struct, frozen=True, kw_only=True):
@@ -75,7 +76,7 @@ class MapRecord(msgspec.Struct, frozen=True, kw_only=True):
     robots: list[str]
     heard: dict[str, dict[str, int]] = {}  # see `CloudOrder`
     keeps_evidence: bool  # false: profile `paper`, kernels without rows
-    rule: tuple[float, float, float, float]  # with which it answered
+    rule: tuple[float, ...]  # with which it answered; the numbers that `AnswerRule` had then
     scores_n: float
     scores_nll: list[float]
     scores_brier: float
@@ -84,6 +85,8 @@ class MapRecord(msgspec.Struct, frozen=True, kw_only=True):
     tiles_digest: str  # sum of the tiles' digests, hexadecimal
 
     def __post_init__(self) -> None:
+        if not _FIRST_RULE <= len(self.rule) <= len(RULE_FIELDS):
+            raise ValueError(f"rule: {len(self.rule)} numbers, need {_FIRST_RULE} to {len(RULE_FIELDS)}")
         AnswerRule(*self.rule)  # raises ValueError where it is none
 
     @property

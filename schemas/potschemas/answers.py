@@ -27,13 +27,27 @@ go on: where they call free (f < 0) what is expected to be solid (g > 0), more m
 Asked for evidence only, it is e = 1 where observed (mu = f + g / k), and as above elsewhere: unknown. `observed` and s2 go by
 evidence whatever the map leans on.
 
+A rule with a `full_activation` is of a map whose kernels stand on lattices, and tells how dense evidence is, d = a /
+full_activation. Echoes come from faces: behind them nobody saw whether it is solid, and kernels go on. So what is observed is
+only as sure as evidence is dense there. Its log-odds k mu stay between
+
+    min(g, -(SURE + FREE_GAIN max(0, d - FREE_FROM)))    and    SURE + OCCUPIED_GAIN max(0, d - OCCUPIED_FROM)
+
+the lower one only where the map leans. And beams call all of a face occupied, of which by volume half is: `var` is what the
+squared error of `mean` is by volume,
+
+    var = t (1 - mean)^2 + (1 - t) mean^2
+    t = LEAST + (1 - 2 LEAST) sigmoid(G k mu - B + B_VAR s2 - B_DENSE clip(d - 1, 0, 1))
+
+where t is how often such points are occupied in places whose truth is known.
+
 The gradients of a map without a lean are 0 where unobserved, and elsewhere
 
     grad mu = grad f
     grad s2 = grad v - residual_var grad a, without the second term where a >= 1
     grad mean = mean (1 - mean) (k grad mu - c pi / 16 k^3 mu grad s2)
 
-Those of a map with one follow from the same formulas; see `gradients`.
+Those of a map with one, and where log-odds end, follow from the same formulas; see `gradients`.
 
 Sources: mean, the moderated sigmoid of MacKay, "The evidence framework applied to classification networks", Neural Computation
 4, 1992; var, Daunizeau, "Semi-analytical approximations to statistical moments of sigmoid and softmax mappings of normal
@@ -64,6 +78,12 @@ PRIOR_VAR = 100.0
 # By how much the known activation must be above what makes a point observed, for its evidence to count in full. A full lattice
 # sums to 3.4.
 ROOM, ROOM_IN_SOLID = 1.0, 2.0
+# Log-odds at which what is observed ends where evidence is sparse; the density from which on they may be more, and by how much.
+SURE = 2.15
+OCCUPIED_FROM, OCCUPIED_GAIN = 0.66, 7.0
+FREE_FROM, FREE_GAIN = 0.6, 27.0
+# How often what is observed is occupied, by its log-odds, the latent variance and the density: fitted by benchmarks/errors.py.
+LEAST, G, B, B_VAR, B_DENSE = 5e-5, 0.9, 3.2, 0.017, 3.0
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -86,6 +106,8 @@ class AnswerRule:
     # share of the latent variance that pulls the mean towards 0.5; variances are of single weights and ignore what neighbours
     # have in common, so that 1 makes a map timid
     mean_moderation: float = 1.0
+    # what a full lattice of known kernels sums to, for maps whose answers end and err as those do; 0: for others
+    full_activation: float = 0.0
 
     def __post_init__(self) -> None:
         for name, value in self.fields().items():
@@ -99,7 +121,7 @@ class AnswerRule:
 
     @classmethod
     def of(cls, source: Any) -> AnswerRule:
-        """The rule that a message or a record of settings carries, in attributes of these four names.
+        """The rule that a message or a record of settings carries, in attributes of these names.
 
         Raises:
             ValueError: a number is negative or not finite.
@@ -107,7 +129,7 @@ class AnswerRule:
         return cls(*(getattr(source, name) for name in RULE_FIELDS))
 
     def fields(self) -> dict[str, float]:
-        """The four numbers by their names, as messages take them."""
+        """The numbers by their names, as messages take them."""
         return {name: getattr(self, name) for name in RULE_FIELDS}
 
 
@@ -134,7 +156,7 @@ class Answer(NamedTuple):
     """What a rule makes of the sums at N points."""
 
     mean: Float64  # (N,) P(occupied), in [0, 1]
-    var: Float64  # (N,) variance of that probability, in [0, 0.25]
+    var: Float64  # (N,) variance of that probability: the squared error that is expected, in [0, 1]
     latent_mean: Float  # (N,) log-odds, dtype of the sums
     latent_var: Float  # (N,) log-odds^2, dtype of the sums
     observed: Bool  # (N,) false: no kernel near; unknown, not free
@@ -166,15 +188,22 @@ def answer(
         evidence_only: What is not observed is unknown, whatever the map leans on there.
     """
     observed, latent_var = _observed(sums, rule)
+    spread = _spread(latent_var, rule.mean_moderation)
     if lean is None:
         latent = np.where(observed, sums.mean, 0.0)
         borrowed = np.zeros_like(sums.mean)
     else:
         share, _, _, own = _weighed(sums, rule, lean, evidence_only=evidence_only)
-        latent = share * sums.mean + own * _spread(latent_var, rule.mean_moderation)
+        latent = share * sums.mean + own * spread
         borrowed = np.where(np.isnan(lean) | evidence_only, 0.0, 1.0 - share).astype(sums.mean.dtype)
+    if rule.full_activation:
+        ends = _ends(sums, rule, lean)
+        latent = np.clip(latent, ends.low * spread, ends.high * spread)
     mean = occupancy_mean(latent, latent_var, rule.mean_moderation)
     var = occupancy_var(mean, latent_var)
+    if rule.full_activation:
+        density = sums.activation / rule.full_activation
+        var = np.where(observed, _squared_error(mean, latent / spread, latent_var, density), var)
     return Answer(mean, var, latent.astype(sums.mean.dtype), latent_var, observed, borrowed)
 
 
@@ -202,10 +231,17 @@ def gradients(
     k_slope = (-rule.mean_moderation * math.pi / 16.0 * k**3)[:, None] * var_slope
     share_slope = by_activation[:, None] * slopes.activation + by_lean[:, None] * own_slope
     by_data = share[:, None] * slopes.mean + sums.mean[:, None] * share_slope
-    weighed = (share * sums.mean)[:, None]
-    z_slope = k[:, None] * by_data + weighed * k_slope + own_slope
-    mean = occupancy_mean(share * sums.mean + own / k, latent_var, rule.mean_moderation)
-    latent_slope = by_data + own_slope / k[:, None] - (own / k**2)[:, None] * k_slope
+    z = k * share * sums.mean + own
+    z_slope = k[:, None] * by_data + (share * sums.mean)[:, None] * k_slope + own_slope
+    if rule.full_activation:
+        ends = _ends(sums, rule, None if lean is None else lean.log_odds)
+        low_slope = ends.low_slope[:, None] * slopes.activation + ends.low_by_lean[:, None] * own_slope
+        high_slope = ends.high_slope[:, None] * slopes.activation
+        z_slope = np.where((z < ends.low)[:, None], low_slope, z_slope)
+        z_slope = np.where((z > ends.high)[:, None], high_slope, z_slope)
+        z = np.clip(z, ends.low, ends.high)
+    mean = sigmoid(z)
+    latent_slope = z_slope / k[:, None] - (z / k**2)[:, None] * k_slope
     return AnswerGradients((mean * (1.0 - mean))[:, None] * z_slope, latent_slope.astype(np.float64))
 
 
@@ -231,6 +267,44 @@ def _weighed(
     is_growing = ~is_whole & (grown > 0.0) & (grown < 1.0)
     by_lean = np.where(is_growing & frees & (own > 0.0) & (own < 1.0), -more * grown / room, 0.0)
     return share, np.where(is_growing, 1.0 / room, 0.0), by_lean, own
+
+
+class _Ends(NamedTuple):
+    """Between which log-odds N points are answered; and the slopes of these by the activation, and of the lower by the lean."""
+
+    low: Float64
+    high: Float64
+    low_slope: Float64
+    high_slope: Float64
+    low_by_lean: Float64
+
+
+def _ends(sums: LatentSums, rule: AnswerRule, lean: Float | None) -> _Ends:
+    observed = sums.activation >= rule.observed_activation
+    density = sums.activation.astype(np.float64) / rule.full_activation
+    more_occupied, more_free = np.maximum(density - OCCUPIED_FROM, 0.0), np.maximum(density - FREE_FROM, 0.0)
+    high = np.where(observed, SURE + OCCUPIED_GAIN * more_occupied, np.inf)
+    high_slope = np.where(more_occupied > 0.0, OCCUPIED_GAIN / rule.full_activation, 0.0)
+    if lean is None:
+        none = np.zeros(len(density))
+        return _Ends(none - np.inf, high, none, high_slope, none)
+    least = -(SURE + FREE_GAIN * more_free)
+    leans = observed & ~np.isnan(lean)
+    is_expected = leans & (lean < least)  # free more surely than evidence may tell alone
+    return _Ends(
+        np.where(is_expected, lean, np.where(leans, least, -np.inf)),
+        high,
+        np.where(~is_expected & (more_free > 0.0), -FREE_GAIN / rule.full_activation, 0.0),
+        high_slope,
+        is_expected.astype(np.float64),
+    )
+
+
+def _squared_error(mean: Float64, log_odds: Float64, latent_var: Float, density: Float) -> Float64:
+    """(N,) what is expected by volume of that of a mean, sigmoid(log_odds)."""
+    less = B - B_VAR * latent_var + B_DENSE * np.clip(density - 1.0, 0.0, 1.0)
+    true = LEAST + (1.0 - 2.0 * LEAST) * sigmoid(G * log_odds - less)
+    return true * (1.0 - mean) ** 2 + (1.0 - true) * mean**2
 
 
 def occupancy_mean(latent_mean: Float, latent_var: Float, mean_moderation: float = 1.0) -> Float64:

@@ -158,6 +158,9 @@ class Kernels(Message, frozen=True, kw_only=True):
     prior_var: Finite  # log-odds^2, of the latent where nothing was observed
     residual_var: Finite  # log-odds^2, added in the measure that this sum falls short of 1
     mean_moderation: Finite = 1.0  # share of the latent variance that pulls the mean towards 0.5
+    full_activation: Finite = (
+        0.0  # what a full lattice sums to, where answers end and err as in its maps; 0: elsewhere
+    )
     lean: Lean | Absent = ABSENT  # of a map that leans: its latent is this and the sum over the kernels
     nodes: TileChanges | Absent = ABSENT  # more kernels: nodes of one tile at origin, based on nothing
 
@@ -271,7 +274,7 @@ class Occupancy(Message, frozen=True, kw_only=True):
     schema: ClassVar[str] = "pot.occupancy.v1"
 
     mean: Array  # (N,) float32, P(occupied)
-    var: Array  # (N,) float32, variance of that probability, in [0, 0.25]
+    var: Array  # (N,) float32, variance of that probability: its squared error as expected, in [0, 1]
     latent_mean: Array  # (N,) float32, log-odds
     latent_var: Array  # (N,) float32, log-odds^2
     observed: Array  # (N,) bool; false = nothing was seen near: `mean` is 0.5, or what is expected there
@@ -482,6 +485,9 @@ class TilesPart(Message, frozen=True, kw_only=True):
     prior_var: Finite  # log-odds^2, of the latent where nothing was observed
     residual_var: Finite  # log-odds^2, added in the measure that this sum falls short of 1
     mean_moderation: Finite  # share of the latent variance that pulls the mean towards 0.5
+    full_activation: Finite = (
+        0.0  # what a full lattice sums to, where answers end and err as in its maps; 0: elsewhere
+    )
     changes: TileChanges | Absent = ABSENT  # where the query has a step
     lean: Lean | Absent = ABSENT  # of tiles that differ; with `changes` of those where it is new
 
@@ -600,6 +606,9 @@ class Info(Message, frozen=True, kw_only=True):
     prior_var: Finite  # log-odds^2, of the latent where nothing was observed
     residual_var: Finite  # log-odds^2, added in the measure that this sum falls short of 1
     mean_moderation: Finite = 1.0  # share of the latent variance that pulls the mean towards 0.5
+    full_activation: Finite = (
+        0.0  # what a full lattice sums to, where answers end and err as in its maps; 0: elsewhere
+    )
     limits: Limits  # what the server accepts
     started_ns: Sequence  # when the server started
     durable: bool | Absent = ABSENT  # true: accepted clouds survive a crash of the server, false: they do not

@@ -17,9 +17,12 @@ import pytest
 
 from potschemas import messages
 from potschemas.answers import (
+    FREE_FROM,
+    OCCUPIED_FROM,
     ROOM,
     ROOM_IN_SOLID,
     RULE_FIELDS,
+    SURE,
     AnswerRule,
     LatentGradients,
     LatentSums,
@@ -42,6 +45,7 @@ RULES = [
     DEFAULT_RULE,
     AnswerRule(0.3, 7.0, 20.0, 0.25),
     AnswerRule(0.0, 50.0, 2.0, 0.0),
+    AnswerRule(0.4, 80.0, 20.0, 0.1, 1.5),
 ]
 
 
@@ -121,8 +125,16 @@ def test_an_answer_is_the_rule_point_by_point(rule: AnswerRule) -> None:
     for i, (f, v, a) in enumerate(zip(*sums, strict=True)):
         known = a >= rule.observed_activation
         mu, s2 = (f, v + rule.residual_var * max(0.0, 1.0 - a)) if known else (0.0, rule.prior_var)
-        mean = 1 / (1 + math.exp(-mu / math.sqrt(1 + rule.mean_moderation * math.pi * s2 / 8)))
+        spread = math.sqrt(1 + rule.mean_moderation * math.pi * s2 / 8)
+        if known and rule.full_activation:
+            density = a / rule.full_activation
+            mu = min(mu, spread * (2.15 + 7 * max(0, density - 0.66)))
+        mean = 1 / (1 + math.exp(-mu / spread))
         var = mean * (1 - mean) * (1 - 1 / math.sqrt(1 + math.pi * s2 / 8))
+        if known and rule.full_activation:
+            less = 3.2 - 0.017 * s2 + 3 * min(max(density - 1, 0), 1)
+            true = 0.00005 + 0.9999 / (1 + math.exp(less - 0.9 * mu / spread))
+            var = true * (1 - mean) ** 2 + (1 - true) * mean**2
         np.testing.assert_allclose([column[i] for column in got], [mean, var, mu, s2, known, 0], rtol=1e-12)
 
 
@@ -152,6 +164,42 @@ def test_a_lean_answers_where_nothing_was_seen_and_yields_where_all_was() -> Non
         np.testing.assert_array_equal(got.latent_var, other.latent_var)
 
 
+@pytest.mark.parametrize("lean", [None, np.linspace(-8.0, 8.0, 161)])
+def test_what_is_observed_is_only_as_sure_as_evidence_is_dense(lean: Array | None) -> None:
+    rule, n = DEFAULT_RULE, 161
+    ends = []
+    for density in (0.5, FREE_FROM, OCCUPIED_FROM, 0.8, 1.0):
+        activation = np.full(n, density * rule.full_activation)
+        z = [
+            answer(LatentSums(np.full(n, f), np.full(n, 1.0), activation), rule, lean).mean
+            for f in (-99.0, 99.0)
+        ]
+        ends.append([np.log(p) - np.log1p(-p) for p in z])
+    low, high = np.array(ends)[:, 0], np.array(ends)[:, 1]
+    np.testing.assert_allclose(high[:3], SURE)
+    assert (np.diff(high[2:], axis=0) > 0.5).all()
+    if lean is None:  # free space without a lean ends nowhere
+        assert (low < -10).all()
+    else:  # but that which is expected to be free is, even where little was seen
+        np.testing.assert_allclose(low[:2], np.minimum(lean, -SURE) + np.zeros((2, 1)))
+        assert (np.diff(low[1:], axis=0) <= 0.0).all()
+    unobserved = LatentSums(np.zeros(n), np.ones(n), np.zeros(n))
+    np.testing.assert_allclose(answer(unobserved, rule, lean).mean, 0.5 if lean is None else sigmoid(lean))
+
+
+def test_the_variance_is_that_of_a_face_and_more_for_what_is_called_occupied() -> None:
+    """By volume: half of a face is free, and beams call it occupied. Free space is as free as it is called, or more."""
+    z = np.array([-6.0, -3.0, 3.0, 6.0])
+    sums = LatentSums(z, np.full(4, 70.0), np.full(4, 1.3 * DEFAULT_RULE.full_activation))
+    got = answer(sums, dataclasses.replace(DEFAULT_RULE, mean_moderation=0.0))
+    plain = got.mean * (1 - got.mean)
+    assert (got.var[:2] < plain[:2]).all()
+    assert (got.var[2:] > 4 * plain[2:]).all()
+    assert got.var[2] > 0.25
+    behind = answer(sums._replace(var=np.full(4, 110.0)), DEFAULT_RULE)
+    assert (behind.var[:2] > got.var[:2]).all()
+
+
 @pytest.mark.parametrize("evidence_only", [False, True])
 def test_where_there_is_no_lean_an_answer_is_that_of_a_map_without_one(evidence_only: bool) -> None:
     sums = sums_of(300, 6)
@@ -167,9 +215,17 @@ def test_gradients_are_the_central_differences(rule: AnswerRule) -> None:
     slopes = LatentGradients(*rng.normal(size=(3, 500, 3)))
     got = gradients(sums, slopes, rule)
     # the answer has a jump where a point becomes observed, and a kink at an activation of 1
-    edges = np.stack([np.abs(sums.activation - edge) for edge in (rule.observed_activation, 1.0)])
+    full = rule.full_activation
+    edges = np.stack(
+        [np.abs(sums.activation - edge) for edge in (rule.observed_activation, 1.0, OCCUPIED_FROM * full)]
+    )
     smooth = (edges > 1e-3).all(axis=0)
     assert smooth.sum() > 450
+    if full:
+        assert (
+            answer(sums, rule).mean.max()
+            < answer(sums, dataclasses.replace(rule, full_activation=0.0)).mean.max()
+        )
     for axis in range(3):
         step = LatentSums(*(1e-6 * slope[:, axis] for slope in slopes))
         ahead, behind = (
@@ -186,7 +242,20 @@ def test_gradients_are_the_central_differences(rule: AnswerRule) -> None:
 def test_the_compiled_copy_in_the_rays_is_the_same_answer(rule: AnswerRule) -> None:
     sums = sums_of(2000, 4)
     got = answer(sums, rule)
-    z = [rays.moderated(*at, rule.residual_var, rule.mean_moderation) for at in zip(*sums, strict=True)]
+    moderated = [
+        rays.moderated(*at, rule.residual_var, rule.mean_moderation) for at in zip(*sums, strict=True)
+    ]
+    z = [
+        rays.ended(at, activation, rule.full_activation, math.nan)
+        for at, activation in zip(moderated, sums.activation, strict=True)
+    ]
+    np.testing.assert_allclose(sigmoid(np.array(z))[got.observed], got.mean[got.observed], rtol=1e-12)
+    lean = np.random.default_rng(5).normal(0.0, 4.0, 2000)
+    z = [
+        rays.ended(at + g, activation, rule.full_activation, g)
+        for at, activation, g in zip(moderated, sums.activation, lean, strict=True)
+    ]
+    got = answer(sums, rule, lean, evidence_only=True)  # what is observed counts in full
     np.testing.assert_allclose(sigmoid(np.array(z))[got.observed], got.mean[got.observed], rtol=1e-12)
 
 
@@ -247,6 +316,7 @@ def test_the_formulas_of_the_contract_are_the_answers(
     if lean is not None:
         solid = np.where(sums.mean < 0, np.clip(lean.log_odds, 0, 1), 0)
         edges.append(rule.observed_activation + ROOM + (ROOM_IN_SOLID - ROOM) * solid)
+    edges += [np.full(n, from_density * rule.full_activation) for from_density in (OCCUPIED_FROM, FREE_FROM)]
     near_edge = np.abs(sums.activation - edges).min(axis=0) < 1e-4
     if lean is not None:  # kinks
         near_edge |= np.abs(np.stack([lean.log_odds, lean.log_odds - 1, sums.mean])).min(axis=0) < 1e-4
