@@ -39,7 +39,7 @@ def tables_of(evaluation: Evaluation) -> Iterator[Table]:
     if scores.truth is not None:
         heads = [f"{volume}: {head}" for volume in ("uniform", "ball") for head in ("NLL", "wrong")]
         heads += ["> .9 is occupied", "< .1 is free", "unseen: observed", "sure"]
-        yield _table("truth", [*heads, "Brier / claimed, by sd"], _truth, evaluation)
+        yield _table("truth", [*heads, "squared error / variance, by sd"], _truth, evaluation)
     if scores.faces is not None:
         faces = [*scores.faces.upright_by_range, *scores.faces.upright_by_incidence]
         heads = ["upright: median / p95", "early", "missed", *faces, "level: median / p95"]
@@ -110,7 +110,7 @@ def _truth(row: Row) -> list[str]:
     shares = (
         uniform.called_occupied_true, uniform.called_free_true, uniform.unseen_observed, uniform.unseen_sure,
     )  # fmt: skip
-    sd = " ".join(_number(found.brier / max(found.claimed_brier, 1e-9), 1) for found in truth.sd) or "-"
+    sd = " ".join(_number(found.brier / max(found.rms_sd**2, 1e-9), 1) for found in truth.sd) or "-"
     return [*volume(uniform), *volume(truth.ball), *(_share(share) for share in shares), sd]
 
 

@@ -105,7 +105,7 @@ class Questions:
         self.beams = beams
         self._held_out = BeamQuestions(beams)
         self._rings = None if rings is None else BeamQuestions(rings)
-        self._truth = None if around is None else TruthQuestions(around)
+        self.truth = None if around is None else TruthQuestions(around)
         self._faces = None if around is None else FaceQuestions(around)
         self._openings = (
             OpeningQuestions(recording, around.hits)
@@ -123,7 +123,7 @@ class Questions:
             beams=self._held_out.score(mapper),
             rings=None if self._rings is None else self._rings.score(mapper),
             rays=None if mapper.kernel_map is None else score_rays(mapper.kernel_map, self.beams),
-            truth=None if self._truth is None else self._truth.score(mapper),
+            truth=None if self.truth is None else self.truth.score(mapper),
             faces=None if self._faces is None else self._faces.score(mapper),
             openings=None if self._openings is None else self._openings.score(mapper),
             protocol_1=self._protocol_1.score(mapper),

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from potclient.arrays import Bool, Float64
+from potclient.holdout import LabelledPoints
 from potclient.metrics import Metrics, score
 from potserver.evaluation.mappers import Answer, Mapper
 from potserver.evaluation.surroundings import Surroundings
@@ -100,6 +101,12 @@ class TruthQuestions:
         away /= np.linalg.norm(away, axis=1)[:, None]
         away *= (_BALL_M * rng.random(len(hits)) ** (1 / 2 if around.planar else 1 / 3))[:, None]
         self._uniform, self._ball = _Volume(uniform, around), _Volume(hits + away, around)
+
+    @property
+    def labels(self) -> LabelledPoints:
+        """The points of both volumes, and what is true of them."""
+        volumes = [LabelledPoints(points=v.points, occupied=v.occupied) for v in (self._uniform, self._ball)]
+        return LabelledPoints.concatenate(volumes)
 
     def score(self, mapper: Mapper) -> TruthScores:
         """How a map does."""

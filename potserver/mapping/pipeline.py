@@ -41,7 +41,7 @@ from potserver.mapping.transport import CouplingOptions
 from potserver.numerics.beams import LabelledPoints, label_beams
 
 _FULL, _FULL_IN_PLANE = 3.4, 2.3  # activation that a full lattice of known kernels sums to
-# Half of a lattice sums to about half of it: what has less lies beyond the data. `mean_moderation` of a twentieth: variances are
+# Half of a lattice sums to about half of it: what has less lies beyond the data. `mean_moderation`: variances are
 # of single weights, and all of them would make the map timid.
 DEFAULT_RULE = AnswerRule(
     observed_activation=1.4, residual_var=50.0, mean_moderation=0.05, full_activation=_FULL

@@ -85,6 +85,8 @@ FREE_FROM, FREE_GAIN = 0.6, 27.0
 # How often what is observed is occupied, by its log-odds, the latent variance and the density: fitted by benchmarks/errors.py.
 LEAST, G, B, B_VAR, B_DENSE = 5e-5, 0.9, 3.2, 0.017, 3.0
 
+_NEVER = 60.0  # log-odds: beyond them exponentials overflow in float32
+
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class AnswerRule:
@@ -190,21 +192,23 @@ def answer(
     observed, latent_var = _observed(sums, rule)
     spread = _spread(latent_var, rule.mean_moderation)
     if lean is None:
-        latent = np.where(observed, sums.mean, 0.0)
+        z = np.where(observed, sums.mean, 0.0) / spread
         borrowed = np.zeros_like(sums.mean)
     else:
         share, _, _, own = _weighed(sums, rule, lean, evidence_only=evidence_only)
-        latent = share * sums.mean + own * spread
+        z = share * sums.mean / spread + own
         borrowed = np.where(np.isnan(lean) | evidence_only, 0.0, 1.0 - share).astype(sums.mean.dtype)
     if rule.full_activation:
-        ends = _ends(sums, rule, lean)
-        latent = np.clip(latent, ends.low * spread, ends.high * spread)
-    mean = occupancy_mean(latent, latent_var, rule.mean_moderation)
-    var = occupancy_var(mean, latent_var)
-    if rule.full_activation:
-        density = sums.activation / rule.full_activation
-        var = np.where(observed, _squared_error(mean, latent / spread, latent_var, density), var)
-    return Answer(mean, var, latent.astype(sums.mean.dtype), latent_var, observed, borrowed)
+        density = sums.activation * (1.0 / rule.full_activation)
+        low, high = _ends(density, observed, lean)
+        z = np.minimum(np.maximum(z, low), high)
+        mean = sigmoid(z)
+        unknown = mean * (1.0 - mean) * (1.0 - 1.0 / math.sqrt(1.0 + math.pi / 8.0 * rule.prior_var))
+        var = np.where(observed, _squared_error(mean, z, latent_var, density), unknown)
+    else:
+        mean = sigmoid(z)
+        var = occupancy_var(mean, latent_var)
+    return Answer(mean, var, (z * spread).astype(sums.mean.dtype), latent_var, observed, borrowed)
 
 
 def gradients(
@@ -234,12 +238,15 @@ def gradients(
     z = k * share * sums.mean + own
     z_slope = k[:, None] * by_data + (share * sums.mean)[:, None] * k_slope + own_slope
     if rule.full_activation:
-        ends = _ends(sums, rule, None if lean is None else lean.log_odds)
-        low_slope = ends.low_slope[:, None] * slopes.activation + ends.low_by_lean[:, None] * own_slope
-        high_slope = ends.high_slope[:, None] * slopes.activation
-        z_slope = np.where((z < ends.low)[:, None], low_slope, z_slope)
-        z_slope = np.where((z > ends.high)[:, None], high_slope, z_slope)
-        z = np.clip(z, ends.low, ends.high)
+        density = sums.activation * (1.0 / rule.full_activation)
+        low, high = _ends(density, observed, None if lean is None else lean.log_odds)
+        by_density = slopes.activation / rule.full_activation
+        high_slope = np.where((density > OCCUPIED_FROM)[:, None], OCCUPIED_GAIN * by_density, 0.0)
+        low_slope = np.where((density > FREE_FROM)[:, None], -FREE_GAIN * by_density, 0.0)
+        if lean is not None:
+            low_slope = np.where(np.equal(low, lean.log_odds)[:, None], own_slope, low_slope)
+        z_slope = np.where((z < low)[:, None], low_slope, np.where((z > high)[:, None], high_slope, z_slope))
+        z = np.minimum(np.maximum(z, low), high)
     mean = sigmoid(z)
     latent_slope = z_slope / k[:, None] - (z / k**2)[:, None] * k_slope
     return AnswerGradients((mean * (1.0 - mean))[:, None] * z_slope, latent_slope.astype(np.float64))
@@ -269,42 +276,23 @@ def _weighed(
     return share, np.where(is_growing, 1.0 / room, 0.0), by_lean, own
 
 
-class _Ends(NamedTuple):
-    """Between which log-odds N points are answered; and the slopes of these by the activation, and of the lower by the lean."""
-
-    low: Float64
-    high: Float64
-    low_slope: Float64
-    high_slope: Float64
-    low_by_lean: Float64
-
-
-def _ends(sums: LatentSums, rule: AnswerRule, lean: Float | None) -> _Ends:
-    observed = sums.activation >= rule.observed_activation
-    density = sums.activation.astype(np.float64) / rule.full_activation
-    more_occupied, more_free = np.maximum(density - OCCUPIED_FROM, 0.0), np.maximum(density - FREE_FROM, 0.0)
-    high = np.where(observed, SURE + OCCUPIED_GAIN * more_occupied, np.inf)
-    high_slope = np.where(more_occupied > 0.0, OCCUPIED_GAIN / rule.full_activation, 0.0)
-    if lean is None:
-        none = np.zeros(len(density))
-        return _Ends(none - np.inf, high, none, high_slope, none)
-    least = -(SURE + FREE_GAIN * more_free)
-    leans = observed & ~np.isnan(lean)
-    is_expected = leans & (lean < least)  # free more surely than evidence may tell alone
-    return _Ends(
-        np.where(is_expected, lean, np.where(leans, least, -np.inf)),
-        high,
-        np.where(~is_expected & (more_free > 0.0), -FREE_GAIN / rule.full_activation, 0.0),
-        high_slope,
-        is_expected.astype(np.float64),
-    )
+def _ends(density: Float, observed: Bool, lean: Float | None) -> tuple[Float | float, Float]:
+    """Between which log-odds points are answered; (N,) each."""
+    high = SURE + OCCUPIED_GAIN * np.maximum(density - OCCUPIED_FROM, 0.0)
+    if lean is None:  # what is not observed has log-odds of 0
+        return -math.inf, high
+    least = -SURE - FREE_GAIN * np.maximum(density - FREE_FROM, 0.0)
+    low = np.where(observed & ~np.isnan(lean), np.minimum(lean, least), -np.inf)
+    return low, np.where(observed, high, np.inf)
 
 
-def _squared_error(mean: Float64, log_odds: Float64, latent_var: Float, density: Float) -> Float64:
-    """(N,) what is expected by volume of that of a mean, sigmoid(log_odds)."""
+def _squared_error(mean: Float64, z: Float64, latent_var: Float, density: Float) -> Float64:
+    """(N,) what is expected by volume of that of a mean, sigmoid(z)."""
     less = B - B_VAR * latent_var + B_DENSE * np.clip(density - 1.0, 0.0, 1.0)
-    true = LEAST + (1.0 - 2.0 * LEAST) * sigmoid(G * log_odds - less)
-    return true * (1.0 - mean) ** 2 + (1.0 - true) * mean**2
+    log_odds = np.maximum(G * z.astype(latent_var.dtype) - less, -_NEVER)
+    true = LEAST + (1.0 - 2.0 * LEAST) / (1.0 + np.exp(-log_odds))
+    found: Float64 = mean * mean + true * (1.0 - 2.0 * mean)
+    return found
 
 
 def occupancy_mean(latent_mean: Float, latent_var: Float, mean_moderation: float = 1.0) -> Float64:
