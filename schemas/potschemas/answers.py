@@ -39,7 +39,7 @@ squared error of `mean` is by volume,
     var = t (1 - mean)^2 + (1 - t) mean^2
     t = LEAST + (1 - 2 LEAST) sigmoid(G k mu - B + B_VAR s2 - B_DENSE clip(d - 1, 0, 1))
 
-where t is how often such points are occupied in places whose truth is known.
+where t is how often such points are occupied in places whose truth is known; and t = mean where unobserved.
 
 The gradients of a map without a lean are 0 where unobserved, and elsewhere
 
@@ -81,7 +81,7 @@ ROOM, ROOM_IN_SOLID = 1.0, 2.0
 # Log-odds at which what is observed ends where evidence is sparse; the density from which on they may be more, and by how much.
 SURE = 2.15
 OCCUPIED_FROM, OCCUPIED_GAIN = 0.66, 7.0
-FREE_FROM, FREE_GAIN = 0.6, 27.0
+FREE_FROM, FREE_GAIN = 0.5, 27.0
 # How often what is observed is occupied, by its log-odds, the latent variance and the density: fitted by benchmarks/errors.py.
 LEAST, G, B, B_VAR, B_DENSE = 5e-5, 0.9, 3.2, 0.017, 3.0
 
@@ -203,8 +203,7 @@ def answer(
         low, high = _ends(density, observed, lean)
         z = np.minimum(np.maximum(z, low), high)
         mean = sigmoid(z)
-        unknown = mean * (1.0 - mean) * (1.0 - 1.0 / math.sqrt(1.0 + math.pi / 8.0 * rule.prior_var))
-        var = np.where(observed, _squared_error(mean, z, latent_var, density), unknown)
+        var = np.where(observed, _squared_error(mean, z, latent_var, density), mean * (1.0 - mean))
     else:
         mean = sigmoid(z)
         var = occupancy_var(mean, latent_var)

@@ -158,9 +158,7 @@ class Kernels(Message, frozen=True, kw_only=True):
     prior_var: Finite  # log-odds^2, of the latent where nothing was observed
     residual_var: Finite  # log-odds^2, added in the measure that this sum falls short of 1
     mean_moderation: Finite = 1.0  # share of the latent variance that pulls the mean towards 0.5
-    full_activation: Finite = (
-        0.0  # what a full lattice sums to, where answers end and err as in its maps; 0: elsewhere
-    )
+    full_activation: Finite = 0.0  # what a full lattice of known weights sums to; 0: on none
     lean: Lean | Absent = ABSENT  # of a map that leans: its latent is this and the sum over the kernels
     nodes: TileChanges | Absent = ABSENT  # more kernels: nodes of one tile at origin, based on nothing
 
@@ -485,9 +483,7 @@ class TilesPart(Message, frozen=True, kw_only=True):
     prior_var: Finite  # log-odds^2, of the latent where nothing was observed
     residual_var: Finite  # log-odds^2, added in the measure that this sum falls short of 1
     mean_moderation: Finite  # share of the latent variance that pulls the mean towards 0.5
-    full_activation: Finite = (
-        0.0  # what a full lattice sums to, where answers end and err as in its maps; 0: elsewhere
-    )
+    full_activation: Finite = 0.0  # what a full lattice of known weights sums to; 0: on none
     changes: TileChanges | Absent = ABSENT  # where the query has a step
     lean: Lean | Absent = ABSENT  # of tiles that differ; with `changes` of those where it is new
 
@@ -606,9 +602,7 @@ class Info(Message, frozen=True, kw_only=True):
     prior_var: Finite  # log-odds^2, of the latent where nothing was observed
     residual_var: Finite  # log-odds^2, added in the measure that this sum falls short of 1
     mean_moderation: Finite = 1.0  # share of the latent variance that pulls the mean towards 0.5
-    full_activation: Finite = (
-        0.0  # what a full lattice sums to, where answers end and err as in its maps; 0: elsewhere
-    )
+    full_activation: Finite = 0.0  # what a full lattice of known weights sums to; 0: on none
     limits: Limits  # what the server accepts
     started_ns: Sequence  # when the server started
     durable: bool | Absent = ABSENT  # true: accepted clouds survive a crash of the server, false: they do not

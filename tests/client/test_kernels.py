@@ -182,13 +182,16 @@ def test_a_message_with_a_rule_that_is_none_is_a_bad_reply() -> None:
         KernelSet.from_message(message)
 
 
-def test_files_without_a_moderation_have_the_full_share(tmp_path: Path) -> None:
-    kernels().save(tmp_path / "k.npz")
+@pytest.mark.parametrize(("missing", "value"), [("mean_moderation", 1.0), ("full_activation", 0.0)])
+def test_early_files_lack_numbers_of_the_rule(tmp_path: Path, missing: str, value: float) -> None:
+    ks = kernels()
+    ks = dataclasses.replace(ks, rule=dataclasses.replace(ks.rule, full_activation=3.0))
+    ks.save(tmp_path / "k.npz")
     with np.load(tmp_path / "k.npz") as stored:
-        arrays = {name: stored[name] for name in stored if name != "mean_moderation"}
+        arrays = {name: stored[name] for name in stored if name != missing}
     np.savez(tmp_path / "early.npz", **arrays)
     early = KernelSet.load(tmp_path / "early.npz")
-    assert early.rule == dataclasses.replace(kernels().rule, mean_moderation=1.0)
+    assert early.rule == dataclasses.replace(ks.rule, **{missing: value})
     del arrays["prior_var"]
     np.savez(tmp_path / "none.npz", **arrays)
     with pytest.raises(UsageError, match="prior_var"):

@@ -16,7 +16,7 @@ from potserver.limits import Limits
 from potserver.numerics.evidence import Rows
 from tests.tiled_maps import GRID, free_kernels, lattice_kernels
 
-RULE = AnswerRule(residual_var=50.0, mean_moderation=0.05)
+RULE = AnswerRule(residual_var=50.0, mean_moderation=0.05, full_activation=3.4)
 CLOSE = 2e-4  # of a probability: what the index may leave out, and what lies beyond a window
 KINDS = ("lattices", "planes", "mixed", "free", "empty")
 
@@ -77,6 +77,12 @@ def test_points_answer_as_eq_1_over_all_kernels(kind: str, close: float) -> None
         difference = np.abs(getattr(found, name) - getattr(exact, name))
         assert difference[~on_edge].max() < close
     np.testing.assert_array_equal(found.observed[~on_edge], exact.observed[~on_edge])
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_part_is_planar_if_all_its_kernels_stand_in_planes(kind: str) -> None:
+    parts = list(_tiled(_tiles(kind)).parts.values())
+    assert [part.is_planar for part in parts] == [kind == "planes"] * len(parts)
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -240,6 +240,23 @@ def test_planar_scans_keep_their_kernels_in_their_plane(profile: str, height: fl
     np.testing.assert_allclose(service.snapshot.kernels.hinge_mean[:, 2], height, atol=1e-6)
 
 
+def test_a_map_in_a_plane_knows_that_lattices_sum_to_less_there() -> None:
+    service = _service()
+    rule = service.snapshot.rule
+    service.integrate(_room_scan(planar=True))
+    flat = service.snapshot.rule
+    assert flat.full_activation < rule.full_activation
+    assert flat.observed_activation / flat.full_activation == pytest.approx(
+        rule.observed_activation / rule.full_activation
+    )
+    assert service.snapshot.latent(np.zeros((1, 3))).activation[0] == pytest.approx(
+        flat.full_activation, abs=0.3
+    )
+    service.integrate(_room_scan(seed=1))
+    assert service.snapshot.rule.full_activation == rule.full_activation
+    assert _service("paper").snapshot.rule.full_activation == 0.0
+
+
 @pytest.mark.parametrize("profile", PROFILES)
 def test_maps_at_utm_coordinates_are_the_same_maps(profile: str) -> None:
     """A shift by whole tiles, which every grid of kernels divides."""
