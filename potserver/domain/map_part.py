@@ -13,6 +13,8 @@ from potserver.domain.types import Float64, KernelSet
 from potserver.numerics.bricks import LatticeBricks, NodeKernels, Part, bricks_of
 from potserver.numerics.kernel_index import KernelIndex, build_index
 
+_SAME_M = 1e-3  # heights that differ by less are one
+
 
 @dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
 class MapPart:
@@ -83,14 +85,15 @@ class MapPart:
         )
 
     @property
-    def is_planar(self) -> bool:
-        """Whether all kernels stand on lattices in planes."""
-        return not len(self.rest) and all(found.lattice.plane is not None for found in self.bricks)
-
-    @property
     def kernels(self) -> KernelSet:
         """All kernels, map frame; put together anew each time."""
         return KernelSet.concatenate([kernels.moved(shift) for kernels, shift in self.members])
+
+
+def in_a_plane(parts: Collection[MapPart]) -> bool:
+    """Whether the kernels of a map's parts all stand at one height; not if there are none."""
+    heights = np.array([part.box[:, 2] for part in parts if part.n_kernels])
+    return bool(len(heights)) and float(np.ptp(heights)) < _SAME_M
 
 
 def _box(hinge: Float64) -> Float64:

@@ -14,6 +14,7 @@ import numpy as np
 from potschemas.answers import OBSERVED_ACTIVATION, AnswerRule
 from potserver.domain.dictionary import AtomDictionary
 from potserver.domain.kernel_map import KernelMap
+from potserver.domain.map_part import in_a_plane
 from potserver.domain.map_state import MapState
 from potserver.domain.running_scores import RunningScores
 from potserver.domain.tiles import TiledMap
@@ -150,7 +151,7 @@ class Pipeline(ABC):
         rule = self.method.rule
         if self.method.is_calibrated:
             rule = dataclasses.replace(rule, mean_moderation=scores.moderation(rule.mean_moderation))
-        if rule.full_activation and parts and all(part.is_planar for part in parts):
+        if rule.full_activation and in_a_plane(parts):
             rule = in_plane(rule)
         lean = None if tiled is None else tiled.lean
         return KernelMap(parts, rule=rule, map_revision=revision, threads=self.threads, lean=lean)
@@ -253,7 +254,7 @@ def integrated(
 
 
 def in_plane(rule: AnswerRule) -> AnswerRule:
-    """The rule of a map whose kernels all stand in planes: lattices sum to less there."""
+    """The rule of a map whose kernels all stand in a plane: lattices sum to less there."""
     return dataclasses.replace(
         rule,
         observed_activation=rule.observed_activation * _FULL_IN_PLANE / _FULL,

@@ -83,7 +83,7 @@ SURE = 2.15
 OCCUPIED_FROM, OCCUPIED_GAIN = 0.66, 7.0
 FREE_FROM, FREE_GAIN = 0.5, 27.0
 # How often what is observed is occupied, by its log-odds, the latent variance and the density: fitted by benchmarks/errors.py.
-LEAST, G, B, B_VAR, B_DENSE = 5e-5, 0.9, 3.2, 0.017, 3.0
+LEAST, G, B, B_VAR, B_DENSE = 5e-5, 0.86, 3.1, 0.017, 2.5
 
 _NEVER = 60.0  # log-odds: beyond them exponentials overflow in float32
 

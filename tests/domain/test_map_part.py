@@ -10,6 +10,7 @@ from potserver.asking.grid import Grid
 from potserver.asking.rays import Rays
 from potserver.asking.risk import Risk
 from potserver.domain.kernel_map import KernelMap
+from potserver.domain.map_part import in_a_plane
 from potserver.domain.tiles import COARSE, MapKernels, Tile, TiledMap, TileIndex
 from potserver.domain.types import KernelSet, Unknown, yaw_pose
 from potserver.limits import Limits
@@ -79,10 +80,19 @@ def test_points_answer_as_eq_1_over_all_kernels(kind: str, close: float) -> None
     np.testing.assert_array_equal(found.observed[~on_edge], exact.observed[~on_edge])
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_a_part_is_planar_if_all_its_kernels_stand_in_planes(kind: str) -> None:
-    parts = list(_tiled(_tiles(kind)).parts.values())
-    assert [part.is_planar for part in parts] == [kind == "planes"] * len(parts)
+@pytest.mark.parametrize("height", [0.0, 0.1, 0.35])
+def test_kernels_of_one_height_are_in_a_plane(height: float) -> None:
+    flat = [lattice_kernels(600, seed, GRID.fine_m, planar=True) for seed in range(2)]
+    tiles = {}
+    for x, kernels in enumerate(flat):
+        hinge = kernels.hinge_mean.copy()
+        hinge[:, 2] = height
+        tiles[(4 * x, 0, 0)] = kernels.replace(hinge_mean=hinge)
+    assert in_a_plane(_tiled(tiles).parts.values())
+    higher = {(0, 0, 1): flat[0], **tiles}
+    assert not in_a_plane(_tiled(higher).parts.values())
+    assert not in_a_plane(_tiled(_tiles("lattices")).parts.values())
+    assert not in_a_plane([])
 
 
 @pytest.mark.parametrize("kind", KINDS)

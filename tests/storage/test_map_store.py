@@ -555,41 +555,27 @@ def test_a_scan_that_cannot_be_repeated_is_not_left_out(
     assert isinstance(refused.value.__cause__, EmptyError)
 
 
-def _with_rule(path: Path, change: Callable[[list[float]], list[float]]) -> None:
-    with sqlite(path) as connection:
-        ((record,),) = connection.execute("SELECT record FROM map").fetchall()
-        content = json.loads(unsealed(record))
-        content["rule"] = change(content["rule"])
-        changed = json.dumps(content).encode()
-        connection.execute("UPDATE map SET record = ?", (sealed(changed),))
-
-
 @pytest.mark.parametrize(
-    ("change", "what"),
-    [
-        (lambda rule: [rule[0], -1.0, *rule[2:]], "prior_var"),
-        (lambda rule: rule[:3], "3 numbers"),
-        (lambda rule: [*rule, 1.0], "6 numbers"),
-    ],
+    ("rule", "what"), [([1.4, -1.0, 0.0, 1.0], "prior_var"), ([1.4], "1 numbers"), ([1.4] * 6, "6 numbers")]
 )
-def test_a_file_whose_rule_is_none_is_damaged(
-    tmp_path: Path, change: Callable[[list[float]], list[float]], what: str
-) -> None:
-    path = tmp_path / "m.map"
-    write_map(path, _other_state(), Origin("default", True, {}))
-    _with_rule(path, change)
+def test_a_file_whose_rule_is_none_is_damaged(tmp_path: Path, rule: list[float], what: str) -> None:
     with pytest.raises(MapFileError, match=what) as refused:
-        read_map(path)
+        read_map(_with_rule(tmp_path / "m.map", rule))
     assert refused.value.reason == "damaged"
 
 
 def test_a_file_of_when_rules_had_four_numbers_is_read(tmp_path: Path) -> None:
-    path = tmp_path / "m.map"
-    state = _other_state()
-    write_map(path, state, Origin("default", True, {}))
-    _with_rule(path, lambda rule: rule[:4])
-    found = read_map(path).record.answer_rule
-    assert found == dataclasses.replace(state.snapshot.rule, full_activation=0.0)
+    found = read_map(_with_rule(tmp_path / "m.map", [1.4, 100.0, 50.0, 0.05])).record.answer_rule
+    assert dataclasses.astuple(found) == (1.4, 100.0, 50.0, 0.05, 0.0)
+
+
+def _with_rule(path: Path, rule: list[float]) -> Path:
+    write_map(path, _other_state(), Origin("default", True, {}))
+    with sqlite(path) as connection:
+        ((record,),) = connection.execute("SELECT record FROM map").fetchall()
+        changed = json.dumps(json.loads(unsealed(record)) | {"rule": rule}).encode()
+        connection.execute("UPDATE map SET record = ?", (sealed(changed),))
+    return path
 
 
 def test_a_map_file_is_written_whole_or_not_at_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
