@@ -15,6 +15,7 @@ from potclient.errors import UsageError
 from potclient.extras import how_to_install
 from potclient.files import whole
 from potclient.occupancy import Grid
+from potschemas.answers import occupancy_var
 
 _LEVEL = 0.5
 _LARGEST_SD = 0.5  # of a probability
@@ -27,7 +28,7 @@ class Mesh(NamedTuple):
 
     vertices: Float32  # (V, 3) m
     faces: NDArray[np.int64]  # (F, 3)
-    sd: Float32  # (V,) standard deviation of the occupancy probability, 0 to 0.5
+    sd: Float32  # (V,) standard deviation of the occupancy probability by that of its latent, 0 to 0.5
 
     @property
     def colours(self) -> NDArray[np.uint8]:
@@ -75,7 +76,11 @@ def mesh_of(grid: Grid) -> Mesh:
     known = grid.observed[low] & grid.observed[high]  # a crossing beside what was not observed is none
     faces = faces[known[faces].all(axis=1)]
     used, faces = np.unique(faces, return_inverse=True)
-    var = (1 - share) * grid.var[low] + share * grid.var[high]
+    # by the latent variance: the expected squared error of one half is the same everywhere
+    low_var, high_var = (
+        occupancy_var(grid.mean[at].astype(np.float64), grid.latent_var[at]) for at in (low, high)
+    )
+    var = (1 - share) * low_var + share * high_var
     sd = np.sqrt(np.maximum(var[used], 0)).astype(np.float32)
     places, faces = places[used], faces.reshape(-1, 3)
     vertices = np.asarray(grid.lower, np.float64) + (places + 0.5) * grid.resolution

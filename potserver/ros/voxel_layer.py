@@ -12,6 +12,7 @@ from potclient.cells import CellBox
 from potclient.client import MapClient
 from potclient.occupancy import Grid
 from potclient.octomap import KEY_ORIGIN, Leaves, OcTreeBuilder
+from potschemas.answers import occupancy_var
 from potserver.ros.changes import Box, Change, changed_boxes
 from potserver.ros.settings import RosSettings
 
@@ -109,7 +110,9 @@ class VoxelLayer:
             is_low = (answer.latent_mean < 0) == (low < 0)
             left, right = np.where(is_low, share, left), np.where(is_low, right, share)
             low, high = np.where(is_low, answer.latent_mean, low), np.where(is_low, high, answer.latent_mean)
-        return Crossings(edges.cells, points, np.sqrt(answer.var))
+        # by the latent variance: the expected squared error of one half is the same everywhere
+        var = occupancy_var(answer.mean.astype(np.float64), answer.latent_var)
+        return Crossings(edges.cells, points, np.sqrt(var))
 
     def _renew(self, box: Box) -> None:
         """Ask for all cells of a box, and put the answers in the place of those before."""

@@ -14,6 +14,7 @@ from potclient.mesh import Mesh, mesh_of
 from potclient.occupancy import Grid
 from potclient.watched import WatchedCloud
 from potschemas import messages
+from potschemas.answers import occupancy_var
 
 TileIndex = tuple[int, int, int]
 
@@ -70,9 +71,9 @@ def layers_of(grid: Grid) -> Layers:
     if grid.shape[2] > 1:
         return Layers(mesh_of(grid), _centres(grid, free), _centres(grid, unknown))
     occupied = grid.observed & (grid.mean >= 0.5)
-    mesh = Mesh(
-        _centres(grid, occupied).astype(np.float32), np.zeros((0, 3), np.int64), np.sqrt(grid.var[occupied])
-    )
+    var = occupancy_var(grid.mean[occupied].astype(np.float64), grid.latent_var[occupied])
+    sd = np.sqrt(var).astype(np.float32)
+    mesh = Mesh(_centres(grid, occupied).astype(np.float32), np.zeros((0, 3), np.int64), sd)
     return Layers(mesh, _centres(grid, free), _centres(grid, unknown))
 
 
