@@ -18,6 +18,7 @@ from potclient.export import export_bt
 from potclient.octomap import read_bt
 from potclient.ros import types
 from potclient.ros.point_clouds import read_point_cloud
+from potschemas.answers import occupancy_var
 from potserver.config import load_settings
 from potserver.server import MapServer
 from tests.ros import messages as ros
@@ -233,7 +234,8 @@ def test_surfaces_are_where_the_map_says_one_half(nodes: Stranger, client: MapCl
     answer = client.occupancy(points)
     assert np.median(np.abs(answer.mean - 0.5)) < 0.05
     rows = np.frombuffer(message.data.tobytes(), np.dtype([("xyz", "<f4", 3), ("sd", "<f4"), ("rgb", "<u4")]))
-    assert np.allclose(rows["sd"], np.sqrt(answer.var), atol=1e-3)
+    sd = np.sqrt(occupancy_var(answer.mean.astype(np.float64), answer.latent_var))
+    assert np.allclose(rows["sd"], sd, atol=1e-3)
     blue, red = rows["rgb"] & 255, rows["rgb"] >> 16
     assert (blue + red).min() >= 254
     assert np.corrcoef(red, rows["sd"])[0, 1] > 0.9
