@@ -23,7 +23,7 @@ class Occupancy:
     """What a map says at N points, in the order asked."""
 
     mean: Float32  # (N,) P(occupied)
-    var: Float32  # (N,) variance of that probability: its squared error as expected, in [0, 1]
+    var: Float32  # (N,) variance of that probability: its squared error as expected, in [0, 0.25]
     latent_mean: Float32  # (N,) log-odds
     latent_var: Float32  # (N,) log-odds^2
     observed: Bool  # (N,) false = nothing was seen near: `mean` is 0.5, or what the map expects there

@@ -283,7 +283,7 @@ class Occupancy:
     """What a map says at N points, in the order asked."""
 
     mean: Float64  # (N,) P(occupied)
-    var: Float64  # (N,) variance of that probability: its squared error as expected, in [0, 1]
+    var: Float64  # (N,) variance of that probability: its squared error as expected, in [0, 0.25]
     latent_mean: Float32  # (N,) log-odds
     latent_var: Float32  # (N,) log-odds^2
     observed: Bool  # (N,) false = no kernel near: unknown, not free

@@ -36,7 +36,7 @@ only as sure as evidence is dense there. Its log-odds k mu stay between
 the lower one only where the map leans. And beams call all of a face occupied, of which by volume half is: `var` is what the
 squared error of `mean` is by volume,
 
-    var = t (1 - mean)^2 + (1 - t) mean^2
+    var = min(t (1 - mean)^2 + (1 - t) mean^2, .25)
     t = LEAST + (1 - 2 LEAST) sigmoid(G k mu - B + B_VAR s2 - B_DENSE clip(d - 1, 0, 1))
 
 where t is how often such points are occupied in places whose truth is known; and t = mean where unobserved.
@@ -85,6 +85,7 @@ FREE_FROM, FREE_GAIN = 0.5, 27.0
 # How often what is observed is occupied, by its log-odds, the latent variance and the density: fitted by benchmarks/errors.py.
 LEAST, G, B, B_VAR, B_DENSE = 5e-5, 0.86, 3.1, 0.017, 2.5
 
+_MOST_VAR = 0.25  # of a probability: one half that is true as often as not
 _NEVER = 60.0  # log-odds: beyond them exponentials overflow in float32
 
 
@@ -158,7 +159,7 @@ class Answer(NamedTuple):
     """What a rule makes of the sums at N points."""
 
     mean: Float64  # (N,) P(occupied), in [0, 1]
-    var: Float64  # (N,) variance of that probability: the squared error that is expected, in [0, 1]
+    var: Float64  # (N,) variance of that probability: the squared error that is expected, in [0, 0.25]
     latent_mean: Float  # (N,) log-odds, dtype of the sums
     latent_var: Float  # (N,) log-odds^2, dtype of the sums
     observed: Bool  # (N,) false: no kernel near; unknown, not free
@@ -290,7 +291,7 @@ def _squared_error(mean: Float64, z: Float64, latent_var: Float, density: Float)
     less = B - B_VAR * latent_var + B_DENSE * np.clip(density - 1.0, 0.0, 1.0)
     log_odds = np.maximum(G * z.astype(latent_var.dtype) - less, -_NEVER)
     true = LEAST + (1.0 - 2.0 * LEAST) / (1.0 + np.exp(-log_odds))
-    found: Float64 = mean * mean + true * (1.0 - 2.0 * mean)
+    found: Float64 = np.minimum(mean * mean + true * (1.0 - 2.0 * mean), _MOST_VAR)
     return found
 
 

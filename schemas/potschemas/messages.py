@@ -272,7 +272,7 @@ class Occupancy(Message, frozen=True, kw_only=True):
     schema: ClassVar[str] = "pot.occupancy.v1"
 
     mean: Array  # (N,) float32, P(occupied)
-    var: Array  # (N,) float32, variance of that probability: its squared error as expected, in [0, 1]
+    var: Array  # (N,) float32, variance of that probability: its squared error as expected, in [0, 0.25]
     latent_mean: Array  # (N,) float32, log-odds
     latent_var: Array  # (N,) float32, log-odds^2
     observed: Array  # (N,) bool; false = nothing was seen near: `mean` is 0.5, or what is expected there
