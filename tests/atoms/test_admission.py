@@ -190,13 +190,7 @@ def test_own_fit_against_counting_pairs(flat: Atom) -> None:
 
 def _biased(atom: Atom, log_odds: float) -> Atom:
     """The same ranking, with everything shifted: one wide kernel over the whole sector, as an attacker would add."""
-    middle = _kernels(
-        atom,
-        **{
-            name: getattr(atom.kernels, name)[:1].copy()
-            for name in ("hinge_mean", "hinge_var", "gamma_shape", "gamma_rate", "weight_mean", "weight_var")
-        },
-    ).kernels.replace(
+    middle = atom.kernels.take(np.array([0])).replace(
         hinge_mean=np.array([[atom.radius_m / 2, 0.0, 0.0]]),
         gamma_rate=(atom.kernels.gamma_shape[:1] * 2.0 * 19.0**2).astype(np.float32),
         weight_mean=np.array([log_odds], np.float32),
