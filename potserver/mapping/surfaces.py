@@ -27,7 +27,7 @@ class FaceSamples(NamedTuple):
 
     # Clearance of near samples along the face's normal, m. Lower ones sharpen faces and cost held-out ends, which lie on them.
     near_m: tuple[float, float] = (0.04, 0.08)
-    near_sigmas: float = 1.0  # of the noise about the face, added to the clearance
+    near_sigmas: float = 1.0  # of the noise about the face, added to the clearance where a plane is known
     near_weight: float = 0.3  # looks of a near sample
     beside_weight: float = (
         0.5  # looks that a scan gives to free space beside the hits of a voxel, where beams pass them

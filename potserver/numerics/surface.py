@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numba as nb
 import numpy as np
 
-from potserver.numerics.arrays import Float64, Int32, Int64
+from potserver.numerics.arrays import Bool, Float64, Int32, Int64
 from potserver.numerics.geometry import bounds
 from potserver.numerics.voxel_hash import empty_table, enter, find, pack
 
@@ -31,6 +31,9 @@ _MOST_SIGMAS = 3.0  # of a voxel's own point from the plane: a pole before a wal
 _OWN_M = 0.01  # the same for planes without noise
 _COSINE_UNKNOWN = 0.7  # the mean over a hemisphere seen from far is 2/3
 _SIGMA_UNKNOWN_M = 0.05
+_ROOM_UNKNOWN_M = (
+    0.15  # of near samples: beams alone do not say how the face lies, nor where between them it goes on
+)
 _LEAST_COSINE = 0.05
 _MOST_OF_BEAM = 0.9
 
@@ -41,6 +44,12 @@ class Normals(NamedTuple):
     normal: Float64  # (H, 3) unit, towards the sensor, in the frame of the hits
     cosine: Float64  # (H,) of the angle between ray and normal, in [0, 1]
     sigma_m: Float64  # (H,) standard deviation of the points about their plane
+
+    @property
+    def is_plane(self) -> Bool:
+        """(H,) whether the hit has one."""
+        found: Bool = self.sigma_m != _SIGMA_UNKNOWN_M
+        return found
 
 
 def normals(hits: Float64, rays: Float64, known: Float64, voxel_m: float, *, planar: bool) -> Normals:
@@ -96,8 +105,8 @@ def near_free(
 ) -> tuple[Float64, Int64]:
     """Free samples on the beams, so far before the hits that their clearance from the face is as asked.
 
-    The clearance, along the normal, is U(low_m, high_m) + sigmas * sigma. Cosines below .05 count as .05. A sample that would
-    lie more than .9 of its beam before the hit is left out.
+    The clearance, along the normal, is U(low_m, high_m) + sigmas * sigma, without a plane U(low_m, high_m) + .15 m. Cosines
+    below .05 count as .05. A sample that would lie more than .9 of its beam before the hit is left out.
 
     Args:
         hits: (H, 3) m, in any frame.
@@ -109,7 +118,8 @@ def near_free(
     Returns:
         points: (N, 3) m, in the frame of the hits, and index: (N,) ascending, the hit of each.
     """
-    clearance = rng.uniform(low_m, high_m, len(hits)) + sigmas * normals.sigma_m
+    noise = np.where(normals.is_plane, sigmas * normals.sigma_m, _ROOM_UNKNOWN_M)
+    clearance = rng.uniform(low_m, high_m, len(hits)) + noise
     back = clearance / np.maximum(normals.cosine, _LEAST_COSINE)
     beam = hits - origin
     length = np.sqrt(np.einsum("ij,ij->i", beam, beam))
