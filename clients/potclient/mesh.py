@@ -14,8 +14,7 @@ from potclient.cells import CellBox, MapSource, Progress, grid_of
 from potclient.errors import UsageError
 from potclient.extras import how_to_install
 from potclient.files import whole
-from potclient.occupancy import Grid
-from potschemas.answers import occupancy_var
+from potclient.occupancy import Grid, surface_var
 
 _LEVEL = 0.5
 _LARGEST_SD = 0.5  # of a probability
@@ -76,11 +75,7 @@ def mesh_of(grid: Grid) -> Mesh:
     known = grid.observed[low] & grid.observed[high]  # a crossing beside what was not observed is none
     faces = faces[known[faces].all(axis=1)]
     used, faces = np.unique(faces, return_inverse=True)
-    # by the latent variance: the expected squared error of one half is the same everywhere
-    low_var, high_var = (
-        occupancy_var(grid.mean[at].astype(np.float64), grid.latent_var[at]) for at in (low, high)
-    )
-    var = (1 - share) * low_var + share * high_var
+    var = (1 - share) * surface_var(grid, low) + share * surface_var(grid, high)
     sd = np.sqrt(np.maximum(var[used], 0)).astype(np.float32)
     places, faces = places[used], faces.reshape(-1, 3)
     vertices = np.asarray(grid.lower, np.float64) + (places + 0.5) * grid.resolution

@@ -11,6 +11,7 @@ import numpy as np
 from potclient.arrays import Bool, Float32, Float64, arrays_of
 from potclient.files import save_npz
 from potschemas import messages
+from potschemas.answers import occupancy_var
 from potschemas.messages import DType
 
 _FIELDS = ("mean", "var", "latent_mean", "latent_var", "observed", "borrowed")
@@ -121,3 +122,12 @@ class Grid:
             revision=np.int64(self.revision),
             **{name: getattr(self, name) for name in _FIELDS},
         )
+
+
+def surface_var(answer: Occupancy | Grid, at: Any = ...) -> Float64:
+    """Variance of the occupancy probability by that of its latent, at some places of an answer: what colours surfaces.
+
+    There the mean is one half, and the expected squared error, `var`, is the same everywhere.
+    """
+    found: Float64 = occupancy_var(answer.mean[at].astype(np.float64), answer.latent_var[at])
+    return found

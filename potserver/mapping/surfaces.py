@@ -29,9 +29,7 @@ class FaceSamples(NamedTuple):
     near_m: tuple[float, float] = (0.04, 0.08)
     near_sigmas: float = 1.0  # of the noise about the face, added to the clearance where a plane is known
     near_weight: float = 0.3  # looks of a near sample
-    beside_weight: float = (
-        0.5  # looks that a scan gives to free space beside the hits of a voxel, where beams pass them
-    )
+    beside_weight: float = 0.5  # looks of free space beside the hits of a voxel, of all beams that pass them
     shadow_m: tuple[float, float] = (0.1, 1.2)  # depth of shadow samples behind the face, along its normal
 
 

@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 from potclient.arrays import Bool, Float32, Float64
 from potclient.cells import CellBox
 from potclient.client import MapClient
-from potclient.occupancy import Grid
+from potclient.occupancy import Grid, surface_var
 from potclient.octomap import KEY_ORIGIN, Leaves, OcTreeBuilder
-from potschemas.answers import occupancy_var
 from potserver.ros.changes import Box, Change, changed_boxes
 from potserver.ros.settings import RosSettings
 
@@ -110,9 +109,7 @@ class VoxelLayer:
             is_low = (answer.latent_mean < 0) == (low < 0)
             left, right = np.where(is_low, share, left), np.where(is_low, right, share)
             low, high = np.where(is_low, answer.latent_mean, low), np.where(is_low, high, answer.latent_mean)
-        # by the latent variance: the expected squared error of one half is the same everywhere
-        var = occupancy_var(answer.mean.astype(np.float64), answer.latent_var)
-        return Crossings(edges.cells, points, np.sqrt(var))
+        return Crossings(edges.cells, points, np.sqrt(surface_var(answer)))
 
     def _renew(self, box: Box) -> None:
         """Ask for all cells of a box, and put the answers in the place of those before."""

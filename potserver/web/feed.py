@@ -12,11 +12,10 @@ from potclient.cells import CellBox, bounds_of, grid_of, layer_of
 from potclient.client import MapClient
 from potclient.errors import UsageError
 from potclient.mesh import Mesh, mesh_of
-from potclient.occupancy import Grid
+from potclient.occupancy import Grid, surface_var
 from potclient.view.layers import TileIndex, tile_box, tiles_between
 from potclient.watched import WatchedCloud
 from potschemas import messages
-from potschemas.answers import occupancy_var
 
 RESOLUTION_M = 0.25
 MAX_SLICE_CELLS = 1_000_000
@@ -207,8 +206,7 @@ def _flat(grid: Grid) -> Mesh:
     vertices = (corner[:, None, :] + square).reshape(-1, 3).astype(np.float32)
     two = np.array([[0, 1, 2], [0, 2, 3]])
     faces = (4 * np.arange(len(cells))[:, None, None] + two).reshape(-1, 3)
-    at = tuple(cells.T)
-    sd = np.sqrt(occupancy_var(grid.mean[at].astype(np.float64), grid.latent_var[at])).astype(np.float32)
+    sd = np.sqrt(surface_var(grid, tuple(cells.T))).astype(np.float32)
     return Mesh(vertices, faces.astype(np.int64), np.repeat(sd, 4))
 
 

@@ -51,7 +51,7 @@ class Place:
         return msgspec.structs.replace(info, limits=limits, lower=LOWER, upper=UPPER)
 
     def params_parts(self, lower: Any = None, upper: Any = None) -> Any:
-        raise NotImplementedError
+        raise AssertionError("surfaces are made of grids")
 
     def grid(self, lower: Any, upper: Any, resolution: float) -> Grid:
         self.n_questions += 1

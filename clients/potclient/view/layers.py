@@ -11,10 +11,9 @@ import numpy as np
 from potclient.arrays import Bool, Float64
 from potclient.cells import CellBox
 from potclient.mesh import Mesh, mesh_of
-from potclient.occupancy import Grid
+from potclient.occupancy import Grid, surface_var
 from potclient.watched import WatchedCloud
 from potschemas import messages
-from potschemas.answers import occupancy_var
 
 TileIndex = tuple[int, int, int]
 
@@ -71,8 +70,7 @@ def layers_of(grid: Grid) -> Layers:
     if grid.shape[2] > 1:
         return Layers(mesh_of(grid), _centres(grid, free), _centres(grid, unknown))
     occupied = grid.observed & (grid.mean >= 0.5)
-    var = occupancy_var(grid.mean[occupied].astype(np.float64), grid.latent_var[occupied])
-    sd = np.sqrt(var).astype(np.float32)
+    sd = np.sqrt(surface_var(grid, occupied)).astype(np.float32)
     mesh = Mesh(_centres(grid, occupied).astype(np.float32), np.zeros((0, 3), np.int64), sd)
     return Layers(mesh, _centres(grid, free), _centres(grid, unknown))
 
